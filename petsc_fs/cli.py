@@ -1,0 +1,345 @@
+"""The command line. Only this module prints, and only on rank 0."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from petsc_fs.errors import PetscFsError, SceneError, UsageError, together
+from petsc_fs.fields import FIELD, in_order
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from petsc_fs.scene import Scene
+    from petsc_fs.solver import Result, Solver
+
+SECONDS_TO_AGREE = 5.0
+"""How long ranks wait for each other after an error before they take the others for stuck."""
+
+DESCRIPTION = """\
+Solve linear systems of contact poromechanics with PETSc's nested fieldsplit preconditioners.
+
+A scene is one such system in an HDF5 file. Try, with the scenes that come along:
+
+  petsc-fs inspect model2.h5
+  petsc-fs solve model2.h5
+  mpiexec -n 2 petsc-fs solve model3.h5 -options_file contact_poromechanics.opts -ksp_monitor
+
+Options with two dashes are this program's; those with one dash are PETSc's and are passed on."""
+
+SOLVE_EPILOG = """\
+PETSc options follow the scene, for example
+  -options_file FILE     an options file of yours, or the name of a shipped one
+  -ksp_rtol 1e-6         relative tolerance      -ksp_monitor   residual at each iteration
+  -ksp_view              the solver tree         -log_view      where time goes
+  -petsc_fs_mat_type aij     one assembled matrix instead of blocks, for direct solvers
+  -petsc_fs_true_rtol 1e-8   tolerance for the true residual, default that of -ksp_rtol
+
+exit codes: 0 the true residual of the untransformed system meets the tolerance; 1 it does not, or the
+solve failed; 2 wrong call or option; 3 a scene that cannot be read or does not fit together"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code. Collective on all ranks of an MPI run."""
+    own, petsc = split_arguments(sys.argv[1:] if argv is None else argv)
+    try:
+        args = _parser().parse_args(own)
+    except SystemExit as e:
+        return int(e.code or 0)
+    from mpi4py import MPI
+
+    comm = MPI.COMM_WORLD
+    try:
+        if petsc and args.command != "solve":
+            raise UsageError(f"{petsc[0]}: PETSc options go with 'solve'; options of this program have two dashes")
+        return int(args.run(args, petsc, comm))
+    except PetscFsError as e:
+        return _fail(comm, f"petsc-fs: {e}", e.exit_code)
+    except KeyboardInterrupt:
+        return _fail(comm, "petsc-fs: interrupted", 130)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return 0
+    except Exception:
+        return _fail(comm, traceback.format_exc().rstrip(), 70)
+
+
+def split_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
+    """This program's arguments, and PETSc's: single-dash options with the values that follow them."""
+    own: list[str] = []
+    petsc: list[str] = []
+    to_petsc = False
+    for word in argv:
+        if word.startswith("--") or word == "-h":
+            to_petsc = False
+        elif word.startswith("-") and not _is_number(word):
+            to_petsc = True
+        (petsc if to_petsc else own).append(word)
+    return own, petsc
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _fail(comm: MPI.Intracomm, message: str, code: int) -> int:
+    """Print one message and return the code if all ranks failed; else end the ranks that are stuck."""
+    request = comm.Ibarrier()
+    deadline = time.monotonic() + (SECONDS_TO_AGREE if comm.size > 1 else 0)
+    while not (agreed := request.Test()) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    if comm.rank == 0 or not agreed:
+        where = "" if agreed else f" (on rank {comm.rank}, others did not get there)"
+        print(message + where, file=sys.stderr, flush=True)
+    if not agreed:
+        comm.Abort(code)
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(prog="petsc-fs", description=DESCRIPTION, formatter_class=raw)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def add(name: str, summary: str, run: Any, **more: Any) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=summary, description=summary, formatter_class=raw, **more)
+        sub.set_defaults(run=run)
+        return sub
+
+    solve = add("solve", "solve a scene and say how well", _solve, epilog=SOLVE_EPILOG)
+    solve.add_argument("scene", metavar="SCENE", help="file, or name of a bundled scene such as model1.h5")
+    solve.add_argument("--report", type=Path, metavar="FILE.json", help="write what was done and measured")
+    solve.add_argument("--save", type=Path, metavar="FILE.h5", help="write the solution, in the scene's numbering")
+
+    inspect = add("inspect", "show fields, blocks and contact states of a scene", _inspect)
+    inspect.add_argument("scene", metavar="SCENE")
+    inspect.add_argument("--plot", type=Path, metavar="FILE", help="draw the block structure (.png, .svg, .pdf)")
+
+    convert = add("convert", "turn a scene into PETSc's binary format, or back", _convert, epilog=CONVERT_EPILOG)
+    convert.add_argument("source", metavar="SOURCE", help="scene (.h5), or folder in PETSc's format")
+    convert.add_argument("target", metavar="TARGET", help="folder to write, or scene (.h5)")
+
+    export = add("export", "run a PorePy model and write its linear systems as scenes", _export)
+    from petsc_fs.porepy.export import add_arguments
+
+    add_arguments(export)
+    return parser
+
+
+CONVERT_EPILOG = """\
+The folder holds matrix.petsc (MatLoad), rhs.petsc and, if known, reference.petsc (VecLoad), one
+fields/NAME.petsc per field (ISLoad: the rows and columns of the field), and scene.h5 with what PETSc's
+format has no place for (cell data, material, units), without which the way back gives less."""
+
+
+def _solve(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
+    from petsc_fs import hdf5, options
+    from petsc_fs.layout import Layout
+
+    with together(comm):
+        path = find_scene(args.scene)
+        dimension, sizes = hdf5.read_sizes(path)
+        for target in (args.report, args.save):
+            if target is not None and not target.absolute().parent.is_dir():
+                raise UsageError(f"{target}: the folder {target.absolute().parent} does not exist")
+        petsc, options_file = _with_options_file(petsc, tuple(sizes))
+
+    import petsc4py
+
+    petsc4py.init(["petsc-fs", *petsc])
+    from petsc4py import PETSc
+
+    from petsc_fs.solver import Solver
+
+    given = options.unused()
+    layout = Layout.contiguous(comm, dimension, sizes)
+    started = time.perf_counter()
+    with together(comm):
+        scene = hdf5.read(path, lambda *_: {f: layout.rows(f) for f in layout.fields})
+    read_seconds = time.perf_counter() - started
+    solver = Solver(scene, comm, layout=layout)
+    result = solver.solve()
+    _refuse_unused(solver, given, comm)
+
+    everything = solver.system.gather(result.solution)
+    if comm.rank == 0:
+        report = _report(scene, solver, result, path, options_file, read_seconds, PETSc.Options().getAll())
+        if args.report is not None:
+            _write_text(args.report, json.dumps(report, indent=2) + "\n")
+        if args.save is not None and everything is not None:
+            hdf5.write_solution(everything, args.save, scene)
+        from petsc_fs.tables import solve_table
+
+        print(solve_table(scene, report), flush=True)
+    return 0 if result.converged else 1
+
+
+def _with_options_file(petsc: list[str], fields: tuple[str, ...]) -> tuple[list[str], Path]:
+    """PETSc's arguments with every options file found and checked; the default one if none is named."""
+    from petsc_fs import options
+
+    petsc = list(petsc)
+    files = []
+    for i, word in enumerate(petsc):
+        if word == "-options_file":
+            if i + 1 == len(petsc):
+                raise UsageError("-options_file: the name of the file is missing")
+            files.append(options.find_options_file(petsc[i + 1]))
+            petsc[i + 1] = str(files[-1])
+    if not files:
+        files = [options.default_for(fields)]
+        petsc = ["-options_file", str(files[0]), *petsc]
+    for file in files:
+        options.check_syntax(file)
+    header = options.read_header(files[0])
+    if not header.fits(fields):
+        raise UsageError(
+            f"{header.path.name} is for scenes with the fields {', '.join(header.fields)}; "
+            f"this one has {', '.join(in_order(fields))}"
+        )
+    return petsc, files[0]
+
+
+def _refuse_unused(solver: Solver, given: list[str], comm: MPI.Intracomm) -> None:
+    """Raise a UsageError on all ranks if an option that the user gave did nothing."""
+    from petsc_fs import options
+
+    useless = comm.bcast([name for name in options.unused() if name in given])
+    if not useless:
+        return
+    valid = options.queried(solver.queried_options) | {"petsc_fs_mat_type", "petsc_fs_true_rtol"}
+    valid = comm.bcast(valid)
+    lines = []
+    for name in useless:
+        similar = options.closest(name, valid - {name})
+        hint = f"; did you mean {' or '.join('-' + s for s in similar)}?" if similar else ""
+        lines.append(f"option -{name} was not used{hint}")
+    raise UsageError("; ".join(lines) if len(lines) < 2 else "\n  ".join([f"{len(lines)} options:", *lines]))
+
+
+def _report(
+    scene: Scene,
+    solver: Solver,
+    result: Result,
+    path: Path,
+    options_file: Path,
+    read_seconds: float,
+    database: dict[str, str],
+) -> dict[str, Any]:
+    """What --report writes and the table shows."""
+    import platform
+
+    import mpi4py
+    import numpy as np
+    from petsc4py import PETSc
+
+    from petsc_fs import hdf5
+
+    return {
+        "scene": path.name,
+        "model": scene.metadata.model,
+        "time_step_index": scene.metadata.time_step_index,
+        "newton_index": scene.metadata.newton_index,
+        "dimension": scene.dimension,
+        "fields": {f: solver.layout.sizes(f)[1] for f in solver.layout.fields},
+        "ranks": solver.layout.comm.size,
+        "iterations": result.iterations,
+        "converged": result.converged,
+        "reason": result.reason,
+        "tolerance": result.tolerance,
+        "true_relative_residual": result.true_relative_residual,
+        "residual_by_field": result.residual_by_field,
+        "error_by_field": result.error_by_field,
+        "read_seconds": read_seconds,
+        "setup_seconds": result.setup_seconds,
+        "solve_seconds": result.solve_seconds,
+        "options_file": options_file.name,
+        "options": database,
+        "versions": {
+            **hdf5.versions(),
+            "petsc": ".".join(map(str, PETSc.Sys.getVersion())),
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            "mpi4py": mpi4py.__version__,
+        },
+    }
+
+
+def _inspect(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
+    from petsc_fs import hdf5
+    from petsc_fs.tables import inspect_table
+
+    if comm.rank:
+        return 0
+    scene = hdf5.read(find_scene(args.scene))
+    print(inspect_table(scene), flush=True)
+    if args.plot is not None:
+        from petsc_fs.plot import plot_blocks
+
+        print(f"block structure drawn in {plot_blocks(scene, args.plot)}")
+    return 0
+
+
+def _convert(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
+    if comm.size > 1:
+        raise UsageError("convert runs on one rank; start it without mpiexec")
+    import petsc4py
+
+    petsc4py.init(["petsc-fs"])
+    from petsc_fs import petsc_binary
+
+    source, target = Path(args.source), Path(args.target)
+    if source.is_dir():
+        written = petsc_binary.to_scene(source, target)
+    else:
+        written = petsc_binary.from_scene(find_scene(args.source), target)
+    print(f"written: {', '.join(str(p) for p in written)}")
+    return 0
+
+
+def _export(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
+    if comm.size > 1:
+        raise UsageError("export runs on one rank, as PorePy does; start it without mpiexec")
+    from petsc_fs.porepy.export import run
+
+    return int(run(args) or 0)
+
+
+def find_scene(name: str) -> Path:
+    """Path of a scene: as given, or else one that is bundled under this name.
+
+    Raises:
+        SceneError: there is neither.
+    """
+    path = Path(name)
+    bundled = Path(__file__).parent / "scenes"
+    if not path.exists() and path.parent == Path() and (bundled / path).exists():
+        return bundled / path
+    if not path.exists():
+        names = ", ".join(sorted(p.name for p in bundled.glob("*.h5")))
+        raise SceneError(f"{path}: no such file; bundled scenes are {names}")
+    return path
+
+
+def _write_text(path: Path, text: str) -> None:
+    """Write a file that appears under its name only once it is complete."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        temporary.replace(path)
+    except OSError as e:
+        raise UsageError(f"{path}: cannot be written: {e.strerror}") from e
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,54 @@
+"""The fields of contact poromechanics: the one table that names them.
+
+A new field is one more row here, its mapping from the simulator, and a level in an options file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Field:
+    """One unknown of the coupled system and the equation that belongs to it.
+
+    Attributes:
+        name: HDF5 group, name in the DM, option prefix and row of the report.
+        index: number of the field in the paper, J_ij (Zabegaev et al., arXiv:2501.07441).
+        vector: whether there is one unknown per coordinate direction and cell, or one per cell.
+        unknown: what the columns are.
+        equation: what the rows are.
+        unit: SI unit of the unknown.
+    """
+
+    name: str
+    index: int
+    vector: bool
+    unknown: str
+    equation: str
+    unit: str
+
+    def block_size(self, dimension: int) -> int:
+        """Unknowns per cell in a domain of this dimension."""
+        return dimension if self.vector else 1
+
+
+FIELDS = (
+    Field("contact", 1, True, "contact traction per fracture cell", "contact conditions C_n, C_tau", "1"),
+    Field("intf_force", 2, True, "interface displacement", "interface force balance", "m"),
+    Field("momentum", 3, True, "displacement of the rock", "momentum balance", "m"),
+    Field("intf_flow", 4, False, "interface Darcy flux", "interface Darcy law", "m^3/s"),
+    Field("mass", 5, False, "pressure in rock, fractures and intersections", "fluid mass balance", "Pa"),
+)
+FIELD = {field.name: field for field in FIELDS}
+FIELD_NAMES = tuple(FIELD)
+
+MECHANICS = ("intf_force", "momentum")
+"""Fields that one multigrid treats together, under the name "mechanics"."""
+
+
+def in_order(names: Iterable[str]) -> tuple[str, ...]:
+    """The given field names in the order of the table."""
+    present = set(names)
+    return tuple(name for name in FIELD_NAMES if name in present)

@@ -1,0 +1,283 @@
+"""The file format `petsc_fs scene`, version 1, in HDF5.
+
+    /                     encoding-type "petsc_fs scene", encoding-version 1, dimension, fields,
+                          model, time_step_index, newton_index, time
+    /units                size of each base unit in SI, as attributes
+    /producers            version of each program that took part, as attributes
+    /fields/NAME          size, block_size, unit; datasets rhs, reference, cell_centers, cell_volumes;
+                          for mass also cell_dimension, for contact also contact_state
+    /blocks/ROW/COLUMN    encoding-type "csr_matrix", shape; datasets indptr, indices, data
+    /material             time_step; datasets, or attributes where one number holds everywhere
+
+Rows and columns are numbered within their field, from 0; vector fields list all components of a
+cell before the next cell. What is unknown is left out.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import fields as attributes
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from petsc_fs.errors import LayoutError, SceneError
+from petsc_fs.fields import FIELD, FIELD_NAMES, in_order
+from petsc_fs.scene import CSR, Material, Metadata, Scene
+
+ENCODING = "petsc_fs scene"
+VERSION = 1
+PER_CELL = ("cell_centers", "cell_volumes", "cell_dimension", "contact_state")
+
+
+def write(scene: Scene, path: str | os.PathLike[str], *, compression: str | None = "gzip") -> Path:
+    """Write a whole scene; the file appears under its name only once it is complete.
+
+    Args:
+        scene: with all rows (not the part of one rank).
+        path: of the file, replaced if it exists.
+        compression: an h5py filter, or None.
+
+    Raises:
+        SceneError: the scene does not fit together, or the file cannot be written.
+    """
+    target = Path(path)
+    scene.validate()
+    if scene.rows is not None and any(scene.row_range(f) != (0, n) for f, n in scene.sizes.items()):
+        raise SceneError(f"{target}: only a whole scene can be written, this is the part of one rank")
+    try:
+        handle, temporary = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+        os.close(handle)
+    except OSError as e:
+        raise SceneError(f"{target}: cannot be written: {e.strerror}") from e
+    try:
+        with h5py.File(temporary, "w") as file:
+            _write(file, scene, {"compression": compression, "shuffle": True} if compression else {})
+        umask = os.umask(0)
+        os.umask(umask)
+        Path(temporary).chmod(0o666 & ~umask)
+        os.replace(temporary, target)
+    except OSError as e:
+        raise SceneError(f"{target}: cannot be written: {e}") from e
+    finally:
+        Path(temporary).unlink(missing_ok=True)
+    return target
+
+
+def _write(file: h5py.File, scene: Scene, options: dict[str, Any]) -> None:
+    def put(group: h5py.Group, name: str, values: Any) -> None:
+        array = np.asarray(values)
+        if array.dtype.kind == "i" and name in ("indices", "indptr"):
+            array = array.astype(np.int32 if (array.size == 0 or array.max() < 2**31) else np.int64)
+        group.create_dataset(name, data=array, **(options if array.size else {}))
+
+    meta = scene.metadata
+    file.attrs["encoding-type"] = ENCODING
+    file.attrs["encoding-version"] = VERSION
+    file.attrs["dimension"] = scene.dimension
+    file.attrs["fields"] = list(scene.fields)
+    for name in ("model", "time_step_index", "newton_index", "time"):
+        file.attrs[name] = getattr(meta, name)
+    file.create_group("units").attrs.update(meta.units)
+    file.create_group("producers").attrs.update(meta.producers | versions())
+
+    for name in scene.fields:
+        group = file.create_group(f"fields/{name}")
+        group.attrs["size"] = scene.sizes[name]
+        group.attrs["block_size"] = scene.block_size(name)
+        group.attrs["unit"] = FIELD[name].unit
+        put(group, "rhs", scene.rhs[name])
+        for what, values in _known_arrays(scene, name).items():
+            put(group, what, values)
+    for (r, c), block in scene.blocks.items():
+        group = file.create_group(f"blocks/{r}/{c}")
+        group.attrs["encoding-type"] = "csr_matrix"
+        group.attrs["shape"] = (scene.sizes[r], scene.sizes[c])
+        for what, values in zip(CSR._fields, block, strict=True):
+            put(group, what, values)
+    if scene.material is not None:
+        group = file.create_group("material")
+        group.attrs["time_step"] = scene.material.time_step
+        for what, value in scene.material.cell_data().items():
+            if np.ndim(value):
+                put(group, what, value)
+            else:
+                group.attrs[what] = float(np.asarray(value))
+
+
+def _known_arrays(scene: Scene, name: str) -> dict[str, Any]:
+    """The optional arrays of a field that the scene has."""
+    found: dict[str, Any] = {
+        "reference": scene.reference.get(name),
+        "cell_centers": scene.cell_centers.get(name),
+        "cell_volumes": scene.cell_volumes.get(name),
+        "cell_dimension": scene.cell_dimension if name == "mass" else None,
+        "contact_state": scene.contact_state if name == "contact" else None,
+    }
+    return {k: v for k, v in found.items() if v is not None}
+
+
+def versions() -> dict[str, str]:
+    """Version of this package and of the file library."""
+    try:
+        own = version("petsc_fs")
+    except PackageNotFoundError:
+        own = "unknown"
+    return {"petsc_fs": own, "h5py": h5py.version.version, "hdf5": h5py.version.hdf5_version}
+
+
+def read_sizes(path: str | os.PathLike[str]) -> tuple[int, dict[str, int]]:
+    """Dimension of a scene in a file, and size of each field, without reading any array.
+
+    Raises:
+        SceneError: the file is not a scene of this version.
+    """
+    with _open(Path(path)) as file:
+        return _header(file)
+
+
+def read(
+    path: str | os.PathLike[str],
+    rows: Callable[[int, dict[str, int]], Mapping[str, tuple[int, int]]] | None = None,
+) -> Scene:
+    """Read a scene, or the rows of one rank.
+
+    Local: each rank calls it for itself and opens the file for reading only.
+
+    Args:
+        path: of the file.
+        rows: given dimension and sizes, the half-open range of rows per field to read; all if None.
+
+    Raises:
+        SceneError: the file is missing, no HDF5, cut short, not a scene, or of another version.
+        LayoutError: its parts do not fit together.
+    """
+    with _open(Path(path)) as file:
+        dimension, sizes = _header(file)
+        ranges = {f: (0, n) for f, n in sizes.items()} if rows is None else dict(rows(dimension, sizes))
+        scene = _read(file, dimension, sizes, ranges)
+        if rows is not None:
+            scene.rows = ranges
+        scene.validate()
+    return scene
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[h5py.File]:
+    """The file, with every way in which it can be unreadable told apart."""
+    if not path.exists():
+        raise SceneError(f"{path}: no such file")
+    if path.is_dir():
+        raise SceneError(f"{path}: is a directory, not a scene")
+    try:
+        file = h5py.File(path, "r")
+    except OSError as e:
+        if isinstance(e, PermissionError):
+            raise SceneError(f"{path}: no permission to read it") from e
+        if "truncated" in str(e):
+            raise SceneError(f"{path}: the file is truncated; copy or export it again") from e
+        raise SceneError(f"{path}: not an HDF5 file, so not a scene; make one with petsc-fs export") from e
+    with file:
+        try:
+            yield file
+        except SceneError as e:
+            raise type(e)(f"{path}: {e}") from e
+        except KeyError as e:
+            raise SceneError(f"{path}: the scene is incomplete: {e.args[0]}") from e
+        except (OSError, RuntimeError, TypeError, ValueError) as e:
+            raise SceneError(f"{path}: the scene is damaged ({e}); copy or export it again") from e
+
+
+def _header(file: h5py.File) -> tuple[int, dict[str, int]]:
+    found, number = file.attrs.get("encoding-type"), file.attrs.get("encoding-version")
+    if found != ENCODING:
+        what = f"its encoding-type is {found!r}" if found is not None else "it has no encoding-type"
+        raise SceneError(f"an HDF5 file, but not a petsc_fs scene: {what}, expected {ENCODING!r}")
+    if not isinstance(number, int | np.integer):
+        raise SceneError(f"encoding-version is {number!r}, expected the number {VERSION}")
+    if number > VERSION:
+        raise SceneError(f"written in version {number} of the format, this petsc_fs reads {VERSION}; update petsc_fs")
+    if number < VERSION:
+        raise SceneError(f"written in version {number} of the format, which is no longer read; export it again")
+    dimension = int(file.attrs["dimension"])
+    sizes: dict[str, int] = {}
+    for name in file["fields"]:
+        if name not in FIELD:
+            raise LayoutError(f"unknown field {name!r}; fields are {', '.join(FIELD_NAMES)}")
+        sizes[name] = int(file["fields"][name].attrs["size"])
+        bs = int(file["fields"][name].attrs["block_size"])
+        if dimension in (2, 3) and bs != FIELD[name].block_size(dimension):
+            raise LayoutError(
+                f"{name}: block_size is {bs}, expected {FIELD[name].block_size(dimension)} in {dimension}D"
+            )
+    return dimension, {name: sizes[name] for name in in_order(sizes)}
+
+
+def _read(
+    file: h5py.File, dimension: int, sizes: dict[str, int], rows: Mapping[str, tuple[int, int]]
+) -> Scene:
+    found: dict[str, dict[str, Any]] = {name: {} for name in ("rhs", "reference", *PER_CELL)}
+    for name in sizes:
+        group = file["fields"][name]
+        bs = FIELD[name].block_size(dimension)
+        for what, store in found.items():
+            if what not in group:
+                continue
+            per_cell = what in PER_CELL
+            expected = sizes[name] // bs if per_cell else sizes[name]
+            if group[what].shape[:1] != (expected,):
+                raise LayoutError(f"{name}: {what} has {group[what].shape[0]} entries, expected {expected}")
+            a, b = rows[name]
+            values = group[what][a // bs : b // bs] if per_cell else group[what][a:b]
+            store[name] = values if what in ("cell_dimension", "contact_state") else np.asarray(values, dtype=np.float64)
+    blocks: dict[tuple[str, str], CSR] = {}
+    for r in sizes:
+        for c in file["blocks"][r] if r in file["blocks"] else ():
+            blocks[r, c] = _read_block(file["blocks"][r][c], f"block ({r}, {c})", sizes[r], *rows[r])
+    return Scene(
+        dimension=dimension,
+        sizes=sizes,
+        blocks=blocks,
+        rhs=found["rhs"],
+        reference=found["reference"],
+        cell_centers=found["cell_centers"],
+        cell_volumes=found["cell_volumes"],
+        cell_dimension=found["cell_dimension"].get("mass"),
+        contact_state=found["contact_state"].get("contact"),
+        material=_read_material(file, rows["mass"]) if "material" in file and "mass" in sizes else None,
+        metadata=Metadata(
+            **{k: _plain(file.attrs[k]) for k in ("model", "time_step_index", "newton_index", "time")},
+            units={k: float(v) for k, v in file["units"].attrs.items()},
+            producers={k: str(v) for k, v in file["producers"].attrs.items()},
+        ),
+    )
+
+
+def _read_block(group: h5py.Group, what: str, size: int, start: int, stop: int) -> CSR:
+    if group["indptr"].shape != (size + 1,):
+        raise LayoutError(f"{what}: indptr has {group['indptr'].size} entries, expected {size + 1}")
+    indptr = group["indptr"][start : stop + 1].astype(np.int64)
+    a, b = int(indptr[0]), int(indptr[-1])
+    if not 0 <= a <= b <= min(group["indices"].size, group["data"].size):
+        raise LayoutError(f"{what}: indptr runs to {b}, but there are {group['data'].size} values")
+    if stop == size and b != group["data"].size:
+        raise LayoutError(f"{what}: indptr ends at {b}, but there are {group['data'].size} values")
+    return CSR(indptr - a, group["indices"][a:b], np.asarray(group["data"][a:b], dtype=np.float64))
+
+
+def _read_material(file: h5py.File, rows: tuple[int, int]) -> Material:
+    group = file["material"]
+    names = [a.name for a in attributes(Material) if a.name != "time_step"]
+    values = {n: group[n][slice(*rows)] if n in group else float(group.attrs[n]) for n in names}
+    return Material(**values, time_step=float(group.attrs["time_step"]))
+
+
+def _plain(value: Any) -> Any:
+    """A Python value from an attribute."""
+    return value.item() if isinstance(value, np.generic) else value

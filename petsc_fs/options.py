@@ -1,0 +1,163 @@
+"""Options files and the options database: files found, checked and described; unused options named."""
+
+from __future__ import annotations
+
+import ctypes
+import difflib
+import os
+import re
+import sys
+import sysconfig
+import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from petsc_fs.errors import UsageError
+from petsc_fs.fields import FIELD_NAMES, in_order
+
+
+def shipped_folder() -> Path:
+    """Folder of the options files that come with this package."""
+    beside = Path(__file__).resolve().parent.parent / "options"
+    return beside if beside.is_dir() else Path(sysconfig.get_path("data")) / "share" / "petsc_fs"
+
+
+def find_options_file(name: str) -> Path:
+    """Path of an options file: as given, or else one that is shipped under this name.
+
+    Raises:
+        UsageError: there is none, or it cannot be read.
+    """
+    path = Path(name)
+    if not path.exists() and (shipped_folder() / path.name).exists() and path.parent in (Path(), Path("options")):
+        path = shipped_folder() / path.name
+    if not path.is_file():
+        names = ", ".join(sorted(p.name for p in shipped_folder().glob("*.opts")))
+        raise UsageError(f"options file {name}: no such file; shipped are {names}")
+    if not os.access(path, os.R_OK):
+        raise UsageError(f"options file {name}: no permission to read it")
+    return path
+
+
+@dataclass(frozen=True)
+class OptionsFile:
+    """What the header of a shipped options file says.
+
+    Attributes:
+        path: of the file.
+        purpose: first line.
+        fields: fields that a scene must have, no more and no fewer; empty if any will do.
+        default: whether `solve` takes it when none is named.
+    """
+
+    path: Path
+    purpose: str
+    fields: tuple[str, ...]
+    default: bool
+
+    def fits(self, fields: Iterable[str]) -> bool:
+        """Whether a scene with these fields can be solved by the file."""
+        return not self.fields or self.fields == in_order(fields)
+
+
+def read_header(path: Path) -> OptionsFile:
+    """Header of an options file: comment lines `# fields: ...` and `# default: yes`."""
+    comments = [line[1:].strip() for line in _text(path).splitlines() if line.startswith("#")]
+    entries = dict(re.match(r"(\w+): *(.*)", c).groups() for c in comments if re.match(r"\w+: ", c))  # type: ignore[union-attr]
+    fields = in_order(f for f in re.findall(r"\w+", entries.get("fields", "")) if f in FIELD_NAMES)
+    return OptionsFile(path, comments[0] if comments else "", fields, entries.get("default") == "yes")
+
+
+def shipped() -> list[OptionsFile]:
+    """All shipped options files, by name."""
+    return [read_header(path) for path in sorted(shipped_folder().glob("*.opts"))]
+
+
+def default_for(fields: Iterable[str]) -> Path:
+    """The shipped options file for scenes with these fields.
+
+    Raises:
+        UsageError: there is none.
+    """
+    names = in_order(fields)
+    for file in shipped():
+        if file.default and file.fits(names):
+            return file.path
+    raise UsageError(f"no default solver for the fields {', '.join(names)}: name one with -options_file")
+
+
+def check_syntax(path: Path) -> None:
+    """Find what PETSc would stop at, with the line.
+
+    Raises:
+        UsageError: a line is no option, or prefixes do not pair up.
+    """
+    depth = 0
+    for number, raw in enumerate(_text(path).splitlines(), start=1):
+        line = raw.split("#")[0].strip()
+        if not line:
+            continue
+        words = line.split()
+        if not re.match(r"-[A-Za-z_]", words[0]):
+            raise UsageError(f"{path}:{number}: {words[0]!r} is not an option; options start with '-'")
+        if words[0] == "-prefix_push" and len(words) < 2:
+            raise UsageError(f"{path}:{number}: -prefix_push without a prefix")
+        depth += {"-prefix_push": 1, "-prefix_pop": -1}.get(words[0], 0)
+        if depth < 0:
+            raise UsageError(f"{path}:{number}: -prefix_pop without a -prefix_push before it")
+    if depth:
+        raise UsageError(f"{path}: {depth} -prefix_push without a -prefix_pop")
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as e:
+        raise UsageError(f"options file {path}: not readable as text: {e}") from e
+
+
+def unused() -> list[str]:
+    """Options in PETSc's database that nothing has asked for, without the dash. Local."""
+    from petsc4py import PETSc
+
+    library = ctypes.CDLL(PETSc.__file__)
+    count = ctypes.c_int64(0)  # wide enough for either PetscInt
+    names, values = ctypes.POINTER(ctypes.c_char_p)(), ctypes.POINTER(ctypes.c_char_p)()
+    arguments = (None, ctypes.byref(count), ctypes.byref(names), ctypes.byref(values))
+    if library.PetscOptionsLeftGet(*arguments):
+        raise RuntimeError("PetscOptionsLeftGet failed")
+    found = [names[i].decode() for i in range(count.value)]
+    library.PetscOptionsLeftRestore(*arguments)
+    return sorted(found)
+
+
+def queried(set_up: Callable[[], None]) -> set[str]:
+    """Names of the options that a set-up asks for, as PETSc's own help lists them.
+
+    Collective if `set_up` is. What is printed meanwhile is swallowed.
+    """
+    from petsc4py import PETSc
+
+    database = PETSc.Options()
+    sys.stdout.flush()
+    saved = os.dup(1)
+    with tempfile.TemporaryFile() as capture:
+        os.dup2(capture.fileno(), 1)
+        database.setValue("help", None)
+        try:
+            set_up()
+        finally:
+            database.delValue("help")
+            PETSc.Sys.syncFlush()
+            ctypes.CDLL(None).fflush(None)
+            os.dup2(saved, 1)
+            os.close(saved)
+        capture.seek(0)
+        text = capture.read().decode(errors="replace")
+    return set(re.findall(r"^\s*-([A-Za-z_]\w*)", text, flags=re.MULTILINE))
+
+
+def closest(name: str, valid: Iterable[str]) -> list[str]:
+    """Up to three valid names that look most like a misspelt one."""
+    return difflib.get_close_matches(name, list(valid), n=3, cutoff=0.8)

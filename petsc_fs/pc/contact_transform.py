@@ -1,0 +1,200 @@
+"""The transformation that makes the contact block invertible, and the exact first Schur complement."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from petsc4py import PETSc
+
+from petsc_fs.dm import Blocks, Members, Problem, field_dm
+from petsc_fs.errors import LayoutError, SceneError, UsageError, together
+from petsc_fs.fields import MECHANICS
+from petsc_fs.pc.wrapper import WrapperPC, choice
+from petsc_fs.scene import CONTACT_STATES
+
+ALMOST_SINGULAR = 1e-14
+
+
+class ContactTransform(WrapperPC):
+    """Right (or left) transformation of the Jacobian, and an inner PC on the transformed matrix.
+
+    The contact block J_11 is singular where a fracture sticks. With D_22 the block diagonal of J_22,
+
+    - right: T = -D_22^-1 J_21, Q_r = I + T in block (2,1), J~ = J Q_r, solution x = Q_r x~;
+    - left: L = -J_12 D_22^-1, Q_l = I + L in block (1,2), J~ = Q_l J, residual r~ = Q_l r,
+
+    has J~_11 = J_11 - J_12 D_22^-1 J_21, block-diagonal and invertible (paper, eq:Qright and
+    eq:J_tilde). The inner PC is set up on a MatNest with the contact column and row of J~ and, in
+    place of the other blocks, S^1 = J_ij - J~_i1 J~_11^-1 J~_1j (eq:S^1). All products are as small
+    as the fractures; other blocks of J are passed on by reference. `intf_force` and `momentum`
+    become one field `mechanics`: one AIJ matrix that keeps the block size for multigrid.
+
+    Options, with the prefix of this PC:
+        -qr_side right|left: the transformation.
+        -qr_pc_type, ...: the inner PC, whose fields are contact, mechanics, intf_flow, mass.
+
+    The operator must be a MatNest over the five fields, or those of them that a scene has.
+    """
+
+    prefix = "qr_"
+    side = "right"
+
+    def build(self, pc: PETSc.PC, problem: Problem, members: Members) -> tuple[PETSc.Mat, PETSc.DM]:
+        """Nest of J~ and S^1, and its DM. Collective."""
+        _, nest = pc.getOperators()
+        names = [name for name, _ in members]
+        if nest.getType() != "nest":
+            raise UsageError("ContactTransform needs the blocks of a MatNest: leave out -petsc_fs_mat_type aij")
+        for needed in ("contact", "intf_force"):
+            if needed not in names:
+                raise UsageError(f"ContactTransform needs a field {needed!r}; this scene has {', '.join(names)}")
+        self.side = choice(pc, "qr_side", ("right", "left"))
+        blocks = {
+            (r, c): nest.getNestSubMatrix(i, j)
+            for i, r in enumerate(names)
+            for j, c in enumerate(names)
+            if nest.getNestSubMatrix(i, j)
+        }
+        eliminated = self._eliminate(blocks, problem)
+        self._contact, self._intf_force = nest.getNestISs()[0][:2]
+        inner_members = merge_mechanics(names)
+        inner_problem = replace(problem, blocks=eliminated)
+        return self._nest(eliminated, inner_members, problem), field_dm(inner_problem, inner_members)
+
+    def _eliminate(self, J: Blocks, problem: Problem) -> Blocks:
+        """Blocks of J~ in the row and column of contact, of S^1 elsewhere."""
+        D_inverse = block_diagonal_inverse(J["intf_force", "intf_force"], "D_22, block of intf_force", problem)
+        S = dict(J)
+        others = {name for pair in J for name in pair}
+        if self.side == "right":
+            self._transform = D_inverse.matMult(J["intf_force", "contact"])
+            changed = {(r, "contact"): (J[r, "intf_force"], self._transform) for r in others if (r, "intf_force") in J}
+        else:
+            self._transform = J["contact", "intf_force"].matMult(D_inverse)
+            changed = {("contact", c): (self._transform, J["intf_force", c]) for c in others if ("intf_force", c) in J}
+        self._transform.scale(-1)
+        for pair, (left, right) in changed.items():
+            S[pair] = add_product(J.get(pair), left, right)
+        C_inverse = block_diagonal_inverse(S["contact", "contact"], "J~_11, block of contact", problem)
+        rows = [r for r in others if r != "contact" and (r, "contact") in S]
+        columns = [c for c in others if c != "contact" and ("contact", c) in S]
+        for c in columns:
+            W = C_inverse.matMult(S["contact", c])
+            W.scale(-1)
+            for r in rows:
+                S[r, c] = add_product(J.get((r, c)), S[r, "contact"], W)
+        return S
+
+    def _nest(self, S: Blocks, members: Members, problem: Problem) -> PETSc.Mat:
+        """One MatNest over the members, mechanics assembled."""
+        comm = problem.layout.comm
+
+        def block(rows: tuple[str, ...], columns: tuple[str, ...]) -> PETSc.Mat | None:
+            grid = [[S.get((r, c)) for c in columns] for r in rows]
+            if len(rows) == len(columns) == 1:
+                return grid[0][0]
+            if not any(m for line in grid for m in line):
+                return None
+            for i, r in enumerate(rows):
+                for j, c in enumerate(columns):
+                    if grid[i][j] is None:
+                        sizes = (problem.layout.sizes(r), problem.layout.sizes(c))
+                        grid[i][j] = PETSc.Mat().createAIJ(sizes, nnz=0, comm=comm)
+                        grid[i][j].assemble()
+            nest = PETSc.Mat().createNest(grid, comm=comm)
+            if rows != columns:
+                return nest
+            D = problem.layout.dimension
+            merged = nest.convert("aij", PETSc.Mat())
+            nest.destroy()
+            merged.setBlockSizes(D, D)
+            return merged
+
+        return PETSc.Mat().createNest([[block(r, c) for _, c in members] for _, r in members], comm=comm)
+
+    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Y = Q_r P^-1 x (right) or P^-1 Q_l x (left). Collective."""
+        if self.side == "right":
+            super().apply(pc, x, y)
+            self._add(self._contact, self._intf_force, y)
+        else:
+            work = x.copy()
+            self._add(self._intf_force, self._contact, work)
+            super().apply(pc, work, y)
+            work.destroy()
+
+    def _add(self, source: PETSc.IS, target: PETSc.IS, v: PETSc.Vec) -> None:
+        """v[target] += transform * v[source]."""
+        a, b = v.getSubVector(source), v.getSubVector(target)
+        self._transform.multAdd(a, b, b)
+        v.restoreSubVector(target, b)
+        v.restoreSubVector(source, a)
+
+    def describe(self) -> str:
+        """The transformation in one line."""
+        where = "J Q_r" if self.side == "right" else "Q_l J"
+        return f"{self.side} transformation, inner PC on {where} with the exact Schur complement of contact"
+
+
+def merge_mechanics(names: list[str]) -> Members:
+    """Fields with those of mechanics as one member, in order."""
+    merged: list[tuple[str, tuple[str, ...]]] = []
+    mechanics = tuple(n for n in names if n in MECHANICS)
+    for name in names:
+        if name not in MECHANICS:
+            merged.append((name, (name,)))
+        elif name == mechanics[0]:
+            merged.append(("mechanics", mechanics))
+    return merged
+
+
+def add_product(M: PETSc.Mat | None, A: PETSc.Mat, B: PETSc.Mat) -> PETSc.Mat:
+    """M + A B as a new matrix with the block sizes of A's rows and B's columns."""
+    X = A.matMult(B)
+    if M:
+        X.axpy(1.0, M, structure=PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+    X.setBlockSizes(A.getBlockSizes()[0], B.getBlockSizes()[1])
+    return X
+
+
+def block_diagonal_inverse(A: PETSc.Mat, what: str, problem: Problem) -> PETSc.Mat:
+    """AIJ with the inverses of the diagonal blocks of a square matrix, block by block.
+
+    Collective.
+
+    Raises:
+        LayoutError: the block size was lost on the way.
+        SceneError: a block is singular to rounding; named with its cell and, if known, contact state.
+    """
+    D = problem.layout.dimension
+    (n, _), _ = A.getSizes()
+    if A.getBlockSize() != D:
+        raise LayoutError(f"{what}: block size is {A.getBlockSize()}, expected {D}")
+    cells = n // D
+    first = A.getOwnershipRange()[0]
+    indptr, indices, values = A.getDiagonalBlock().getValuesCSR()
+    rows = np.repeat(np.arange(n), np.diff(indptr))
+    inside = rows // D == indices // D
+    dense = np.zeros((cells, D, D))
+    dense[rows[inside] // D, rows[inside] % D, indices[inside] % D] = values[inside]
+    with together(problem.layout.comm):
+        singular_values = np.linalg.svd(dense, compute_uv=False)
+        bad = np.flatnonzero(~(singular_values[:, -1] > ALMOST_SINGULAR * singular_values[:, 0]))
+        if bad.size:
+            cell = int(bad[0])
+            state = ""
+            if "contact" in what and problem.contact_state is not None:
+                state = f" ({CONTACT_STATES[int(problem.contact_state[cell])]})"
+            raise SceneError(
+                f"{what}: singular at cell {first // D + cell}{state}, and at {bad.size - 1} more on this rank; "
+                "the contact unknowns cannot be eliminated"
+            )
+    inverse = np.linalg.inv(dense)
+    columns = first + (np.arange(cells) * D)[:, None, None] + np.zeros((D, 1), dtype=np.int64) + np.arange(D)
+    csr = (
+        (np.arange(n + 1) * D).astype(PETSc.IntType),
+        columns.ravel().astype(PETSc.IntType),
+        inverse.ravel(),
+    )
+    return PETSc.Mat().createAIJ(A.getSizes(), bsize=D, csr=csr, comm=problem.layout.comm)

@@ -1,0 +1,382 @@
+"""Scene: one linear system with what its solver needs and nothing of the simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from petsc_fs.errors import LayoutError, SceneError
+from petsc_fs.fields import FIELD, FIELD_NAMES, in_order
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.integer[Any]]
+
+CONTACT_STATES = ("sticking", "sliding", "open")
+"""Names of the values 0, 1, 2 of `Scene.contact_state`."""
+
+
+class CSR(NamedTuple):
+    """A sparse block in compressed rows; columns are numbered within the column field, globally."""
+
+    indptr: Integers
+    indices: Integers
+    data: Floats
+
+
+@dataclass(kw_only=True)
+class Material:
+    """What the fixed-stress diagonals are made of, in the units of the scene.
+
+    Each entry but `time_step` is a number, or an array with one value per mass cell.
+
+    Attributes:
+        shear_modulus: G.
+        lame_lambda: first Lamé coefficient.
+        biot_coefficient: alpha.
+        porosity: phi.
+        fluid_compressibility: c_f.
+        fluid_density: rho_f.
+        normal_jump: normal component of the displacement jump; used on fracture cells only.
+        time_step: length of the time step.
+    """
+
+    shear_modulus: ArrayLike
+    lame_lambda: ArrayLike
+    biot_coefficient: ArrayLike
+    porosity: ArrayLike
+    fluid_compressibility: ArrayLike
+    fluid_density: ArrayLike
+    normal_jump: ArrayLike
+    time_step: float
+
+    def cell_data(self) -> dict[str, ArrayLike]:
+        """Name and value of everything given per mass cell."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "time_step"}
+
+
+@dataclass(kw_only=True)
+class Metadata:
+    """Where a scene comes from.
+
+    Attributes:
+        model: name of the model, with its parameters.
+        time_step_index: number of the time step, from 1; -1 if unknown.
+        newton_index: number of the Newton step in it, from 0; -1 if unknown.
+        time: end of the time step, in the units of the scene; NaN if unknown.
+        units: size of each base unit in SI, for example {"kg": 1e10} where mass counts in 1e10 kg.
+        producers: name and version of each program that took part.
+    """
+
+    model: str = ""
+    time_step_index: int = -1
+    newton_index: int = -1
+    time: float = float("nan")
+    units: dict[str, float] = field(default_factory=dict)
+    producers: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(kw_only=True)
+class Scene:
+    """A Jacobian in blocks, its right-hand side, and what is known about them.
+
+    A scene holds all rows, or, where `rows` says so, those of one rank; then the arrays per row
+    and per cell cover these rows only, while `sizes` and column numbers stay global.
+
+    Attributes:
+        dimension: of the rock matrix, D = 2 or 3.
+        sizes: global number of unknowns of each field present.
+        blocks: (row field, column field) to block; what is missing is zero.
+        rhs: right-hand side per field.
+        reference: a solution known to be accurate, per field; empty if unknown.
+        cell_centers: per field an array (cells, 3); fields without known centres are missing.
+        cell_volumes: per field an array (cells,).
+        cell_dimension: (mass cells,) dimension of the subdomain each pressure lives in.
+        contact_state: (fracture cells,) 0 sticking, 1 sliding, 2 open.
+        material: data of the fixed-stress diagonals, None if unknown.
+        metadata: where the scene comes from.
+        rows: per field the half-open range of rows held here; None if all.
+    """
+
+    dimension: int
+    sizes: dict[str, int]
+    blocks: dict[tuple[str, str], CSR]
+    rhs: dict[str, Floats]
+    reference: dict[str, Floats] = field(default_factory=dict)
+    cell_centers: dict[str, Floats] = field(default_factory=dict)
+    cell_volumes: dict[str, Floats] = field(default_factory=dict)
+    cell_dimension: Integers | None = None
+    contact_state: Integers | None = None
+    material: Material | None = None
+    metadata: Metadata = field(default_factory=Metadata)
+    rows: dict[str, tuple[int, int]] | None = None
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Names of the fields present, in the order of the table."""
+        return in_order(self.sizes)
+
+    def block_size(self, name: str) -> int:
+        """Unknowns per cell of a field."""
+        return FIELD[name].block_size(self.dimension)
+
+    def row_range(self, name: str) -> tuple[int, int]:
+        """Half-open global range of the rows of a field that are held here."""
+        return self.rows[name] if self.rows is not None else (0, self.sizes[name])
+
+    @classmethod
+    def from_matrix(
+        cls,
+        matrix: Any,
+        rhs: ArrayLike,
+        fields: Mapping[str, Any],
+        *,
+        dimension: int,
+        columns: Mapping[str, Any] | None = None,
+        **known: Any,
+    ) -> Scene:
+        """Cut one sparse matrix into the blocks of a scene.
+
+        Args:
+            matrix: (n, n) in compressed rows: anything with `indptr`, `indices` and `data`, such as
+                a `scipy.sparse.csr_matrix`.
+            rhs: (n,) right-hand side.
+            fields: field name to the rows of its equations, as an index array, range or slice.
+                Vector fields list all components of a cell before the next cell.
+            dimension: of the rock matrix.
+            columns: field name to the columns of its unknowns, where they differ from the rows.
+            known: further attributes of the scene (`material`, `cell_centers`, `reference`, ...).
+
+        Raises:
+            LayoutError: a row or column belongs to no field or to two, or rows and columns of a
+                field differ in number.
+        """
+        b = np.asarray(rhs, dtype=np.float64)
+        n = b.size
+        names = in_order(fields)
+        for unknown in set(fields) - set(FIELD_NAMES):
+            raise LayoutError(f"unknown field {unknown!r}; fields are {', '.join(FIELD_NAMES)}")
+        row_ids = {f: _indices(fields[f], n) for f in names}
+        col_ids = {f: _indices(columns[f], n) for f in names} if columns is not None else row_ids
+        for f in names:
+            if row_ids[f].size != col_ids[f].size:
+                raise LayoutError(
+                    f"{f}: {row_ids[f].size} rows but {col_ids[f].size} columns; they must pair up"
+                )
+        _inverse(row_ids, n, "row")
+        owner, local = _inverse(col_ids, n, "column")
+
+        indptr = np.asarray(matrix.indptr, dtype=np.int64)
+        blocks: dict[tuple[str, str], CSR] = {}
+        for r in names:
+            take, counts = _gather(indptr, row_ids[r])
+            cols = np.asarray(matrix.indices)[take]
+            data = np.asarray(matrix.data, dtype=np.float64)[take]
+            row_of = np.repeat(np.arange(row_ids[r].size), counts)
+            owners = owner[cols]
+            for k, c in enumerate(names):
+                mine = owners == k
+                if not mine.any():
+                    continue
+                blocks[r, c] = _sorted_rows(row_of[mine], local[cols[mine]], data[mine], row_ids[r].size)
+        scene = cls(
+            dimension=dimension,
+            sizes={f: row_ids[f].size for f in names},
+            blocks=blocks,
+            rhs={f: b[row_ids[f]] for f in names},
+            **known,
+        )
+        scene.validate()
+        return scene
+
+    def validate(self) -> None:
+        """Check that all parts fit together and are finite.
+
+        Local: looks at the rows held here and does not communicate.
+
+        Raises:
+            LayoutError: a length, block size or column number is wrong.
+            SceneError: a number is not finite, or a value is outside its range.
+        """
+        if self.dimension not in (2, 3):
+            raise SceneError(f"dimension: expected 2 or 3, found {self.dimension}")
+        if not self.sizes:
+            raise SceneError(f"the scene has no field; fields are {', '.join(FIELD_NAMES)}")
+        for name, size in self.sizes.items():
+            if name not in FIELD:
+                raise LayoutError(f"unknown field {name!r}; fields are {', '.join(FIELD_NAMES)}")
+            bs = self.block_size(name)
+            start, stop = self.row_range(name)
+            if size % bs or start % bs or stop % bs:
+                raise LayoutError(
+                    f"{name}: {size} rows, range {start}:{stop}, is not a multiple of block size {bs} "
+                    f"in {self.dimension}D"
+                )
+            if not 0 <= start <= stop <= size:
+                raise LayoutError(f"{name}: row range {start}:{stop} is not inside 0:{size}")
+            self._check_length(name, "rhs", self.rhs.get(name), stop - start)
+            if name in self.reference:
+                self._check_length(name, "reference", self.reference[name], stop - start)
+            cells = (stop - start) // bs
+            if name in self.cell_centers:
+                self._check_length(name, "cell_centers", self.cell_centers[name], cells, 3)
+            if name in self.cell_volumes:
+                self._check_length(name, "cell_volumes", self.cell_volumes[name], cells)
+        for (r, c), block in self.blocks.items():
+            self._check_block(r, c, block)
+        self._check_cell_data()
+
+    def _check_length(
+        self, name: str, what: str, values: NDArray[Any] | None, length: int, width: int | None = None
+    ) -> None:
+        shape = (length,) if width is None else (length, width)
+        if values is None:
+            raise LayoutError(f"{name}: {what} is missing")
+        if values.shape != shape:
+            raise LayoutError(f"{name}: {what} has shape {values.shape}, expected {shape}")
+        if not np.isfinite(values).all():
+            raise SceneError(f"{name}: {what} has an entry that is not finite (NaN or Inf)")
+
+    def _check_block(self, r: str, c: str, block: CSR) -> None:
+        for name in (r, c):
+            if name not in self.sizes:
+                raise LayoutError(f"block ({r}, {c}): the scene has no field {name!r}")
+        start, stop = self.row_range(r)
+        if block.indptr.shape != (stop - start + 1,):
+            raise LayoutError(
+                f"block ({r}, {c}): indptr has {block.indptr.size} entries, expected {stop - start + 1}"
+            )
+        if block.indptr[0] != 0 or (np.diff(block.indptr) < 0).any():
+            raise LayoutError(f"block ({r}, {c}): indptr must start at 0 and not decrease")
+        if not block.indptr[-1] == block.indices.size == block.data.size:
+            raise LayoutError(
+                f"block ({r}, {c}): indptr ends at {block.indptr[-1]}, but there are "
+                f"{block.indices.size} indices and {block.data.size} values"
+            )
+        if block.indices.size and not (0 <= block.indices.min() and block.indices.max() < self.sizes[c]):
+            raise LayoutError(f"block ({r}, {c}): a column number is outside 0:{self.sizes[c]}")
+        if block.indices.size > 1:
+            falls = np.diff(block.indices) <= 0
+            falls[block.indptr[1:-1][(block.indptr[1:-1] > 0) & (block.indptr[1:-1] < block.indices.size)] - 1] = False
+            if falls.any():
+                raise LayoutError(f"block ({r}, {c}): columns of a row must increase, without duplicates")
+        if not np.isfinite(block.data).all():
+            at = np.flatnonzero(~np.isfinite(block.data))[0]
+            row = start + int(np.searchsorted(block.indptr, at, side="right")) - 1
+            raise SceneError(f"block ({r}, {c}): row {row} has an entry that is not finite (NaN or Inf)")
+
+    def _check_cell_data(self) -> None:
+        if self.contact_state is not None:
+            start, stop = self.row_range("contact") if "contact" in self.sizes else (0, 0)
+            cells = (stop - start) // self.dimension
+            if self.contact_state.shape != (cells,):
+                raise LayoutError(f"contact_state has shape {self.contact_state.shape}, expected {(cells,)}")
+            if not np.isin(self.contact_state, range(len(CONTACT_STATES))).all():
+                raise SceneError("contact_state: expected 0 (sticking), 1 (sliding) or 2 (open)")
+        if "mass" not in self.sizes:
+            return
+        start, stop = self.row_range("mass")
+        if self.cell_dimension is not None:
+            self._check_length("mass", "cell_dimension", self.cell_dimension, stop - start)
+            if ((self.cell_dimension < 0) | (self.cell_dimension > self.dimension)).any():
+                raise SceneError(f"mass: cell_dimension must lie between 0 and {self.dimension}")
+        if self.material is not None:
+            for name, value in self.material.cell_data().items():
+                values = np.asarray(value, dtype=np.float64)
+                if values.ndim:
+                    self._check_length("mass", name, values, stop - start)
+                elif not np.isfinite(values):
+                    raise SceneError(f"material: {name} is not finite")
+            if not (np.isfinite(self.material.time_step) and self.material.time_step > 0):
+                raise SceneError(f"material: time_step must be positive, found {self.material.time_step}")
+
+    def restrict(self, rows: Mapping[str, tuple[int, int]]) -> Scene:
+        """The part of a whole scene that one rank holds.
+
+        Args:
+            rows: per field a half-open range of global rows, whole cells.
+        """
+        if self.rows is not None:
+            raise LayoutError("restrict: the scene is already the part of one rank")
+
+        def cells(name: str) -> slice:
+            bs = self.block_size(name)
+            return slice(rows[name][0] // bs, rows[name][1] // bs)
+
+        material = self.material
+        if material is not None:
+            cut = {k: v if np.ndim(v) == 0 else np.asarray(v)[cells("mass")] for k, v in material.cell_data().items()}
+            material = Material(**cut, time_step=material.time_step)
+        part = Scene(
+            dimension=self.dimension,
+            sizes=dict(self.sizes),
+            blocks={(r, c): csr_rows(b, *rows[r]) for (r, c), b in self.blocks.items()},
+            rhs={f: v[slice(*rows[f])] for f, v in self.rhs.items()},
+            reference={f: v[slice(*rows[f])] for f, v in self.reference.items()},
+            cell_centers={f: v[cells(f)] for f, v in self.cell_centers.items()},
+            cell_volumes={f: v[cells(f)] for f, v in self.cell_volumes.items()},
+            cell_dimension=None if self.cell_dimension is None else self.cell_dimension[cells("mass")],
+            contact_state=None if self.contact_state is None else self.contact_state[cells("contact")],
+            material=material,
+            metadata=self.metadata,
+            rows={f: (int(a), int(b)) for f, (a, b) in rows.items()},
+        )
+        part.validate()
+        return part
+
+
+def csr_rows(block: CSR, start: int, stop: int) -> CSR:
+    """Rows start:stop of a block."""
+    a, b = block.indptr[start], block.indptr[stop]
+    return CSR(block.indptr[start : stop + 1] - a, block.indices[a:b], block.data[a:b])
+
+
+def _indices(spec: Any, n: int) -> Integers:
+    """Index array from an array, range or slice."""
+    if isinstance(spec, slice):
+        return np.arange(*spec.indices(n))
+    return np.asarray(spec, dtype=np.int64).ravel()
+
+
+def _inverse(ids: Mapping[str, Integers], n: int, what: str) -> tuple[Integers, Integers]:
+    """For each index the number of its field and its place there.
+
+    Raises:
+        LayoutError: an index is outside 0:n, or in no field, or in two.
+    """
+    owner = np.full(n, -1, dtype=np.int8)
+    local = np.zeros(n, dtype=np.int64)
+    for k, (name, index) in enumerate(ids.items()):
+        if index.size and not (0 <= index.min() and index.max() < n):
+            raise LayoutError(f"{name}: a {what} number is outside 0:{n}")
+        if (owner[index] >= 0).any() or np.unique(index).size != index.size:
+            raise LayoutError(f"{name}: a {what} is listed twice or belongs to two fields")
+        owner[index] = k
+        local[index] = np.arange(index.size)
+    missing = np.flatnonzero(owner < 0)
+    if missing.size:
+        raise LayoutError(f"{missing.size} {what}s belong to no field, the first is {missing[0]}")
+    return owner, local
+
+
+def _gather(indptr: Integers, rows: Integers) -> tuple[Integers, Integers]:
+    """Positions of all entries of the given rows, row by row, and the number of entries of each."""
+    counts = np.diff(indptr)[rows]
+    offset = np.concatenate([[0], np.cumsum(counts)[:-1]]) if rows.size else np.zeros(0, dtype=np.int64)
+    return np.repeat(indptr[rows] - offset, counts) + np.arange(counts.sum()), counts
+
+
+def _sorted_rows(rows: Integers, cols: Integers, data: Floats, n: int) -> CSR:
+    """Compressed rows with sorted columns from triplets whose rows do not decrease."""
+    order = np.lexsort((cols, rows))
+    indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))])
+    return CSR(indptr, cols[order], data[order])
+
+
+def contact_state_counts(states: Iterable[int]) -> dict[str, int]:
+    """Number of fracture cells in each contact state."""
+    counts = np.bincount(np.asarray(list(states), dtype=np.int64), minlength=len(CONTACT_STATES))
+    return dict(zip(CONTACT_STATES, counts.tolist(), strict=True))

@@ -1,0 +1,242 @@
+"""Solver: a KSP with its preconditioner tree on a system, timed and judged by the true residual."""
+
+from __future__ import annotations
+
+import atexit
+import itertools
+import re
+import time
+import weakref
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from petsc_fs.errors import PetscFsError, SolveError, UsageError, together
+from petsc_fs.layout import Distribute, Layout
+from petsc_fs.scene import Scene
+from petsc_fs.system import FieldArrays, PatternChanged, System
+
+ROUNDING = 1.01
+"""Factor by which the true residual may exceed the tolerance that the recursive one has met."""
+
+
+@dataclass
+class Result:
+    """What a solve did.
+
+    Attributes:
+        iterations: of the outer Krylov method.
+        converged: whether the true residual of the untransformed system meets the tolerance.
+        reason: PETSc's name of the reason why the Krylov method stopped.
+        true_relative_residual: |b - J x| / |b|.
+        tolerance: what `true_relative_residual` is held against.
+        residual_by_field: |b - J x| restricted to each field / |b|.
+        error_by_field: |x - reference| / |reference| per field, where a reference is known; the
+            absolute error where the reference is zero.
+        setup_seconds: building PETSc's matrices and setting the preconditioner up, for this solve.
+        solve_seconds: the Krylov method.
+        solution: local rows of each field.
+    """
+
+    iterations: int
+    converged: bool
+    reason: str
+    true_relative_residual: float
+    tolerance: float
+    residual_by_field: dict[str, float]
+    error_by_field: dict[str, float]
+    setup_seconds: float
+    solve_seconds: float
+    solution: FieldArrays = field(repr=False)
+
+
+_numbers = itertools.count()
+_live: weakref.WeakSet[Solver] = weakref.WeakSet()
+
+
+@atexit.register
+def _destroy_live() -> None:
+    """Free what Python PCs hold while Python still runs: PetscFinalize comes after it."""
+    for solver in sorted(_live, key=lambda s: s._number):
+        solver.destroy()
+
+
+class Solver:
+    """Solves a scene by what the options database says, and further scenes of the same structure.
+
+    Options:
+        -petsc_fs_mat_type nest|aij: storage of the Jacobian; aij copies the blocks into one matrix.
+        -petsc_fs_true_rtol r: relative true residual that counts as converged; default -ksp_rtol.
+    """
+
+    def __init__(self, scene: Scene, comm: PETSc.Comm | None = None, *, layout: Layout | None = None, prefix: str = "") -> None:
+        """Build the system; nothing is factored yet.
+
+        Collective.
+
+        Args:
+            scene: all rows on every rank, or the rows of this rank as `layout` has them.
+            comm: communicator, default PETSC_COMM_WORLD.
+            layout: distribution of rows; default contiguous.
+            prefix: of all options of this solver, including its own.
+
+        Raises:
+            SceneError: the scene does not fit together.
+            UsageError: an option has an impossible value.
+        """
+        from mpi4py import MPI
+
+        mpi = (comm or PETSc.COMM_WORLD).tompi4py() if not isinstance(comm, MPI.Comm) else comm
+        started = time.perf_counter()
+        self.prefix = prefix
+        self._number = next(_numbers)
+        _live.add(self)
+        self.layout = layout or Layout.contiguous(mpi, scene.dimension, scene.sizes)
+        options = PETSc.Options(prefix)
+        mat_type = options.getString("petsc_fs_mat_type", "nest")
+        if mat_type not in ("nest", "aij"):
+            raise UsageError(f"-{prefix}petsc_fs_mat_type {mat_type}: expected nest or aij")
+        with together(mpi):
+            self.scene = scene if scene.rows is not None else scene.restrict(_ranges(self.layout))
+        self.system = System(self.scene, self.layout, mat_type=mat_type)
+        self.ksp = self._create_ksp()
+        self.true_rtol = options.getReal("petsc_fs_true_rtol", self.ksp.getTolerances()[0])
+        self.x = self.system.J.createVecRight()
+        self._built_seconds = time.perf_counter() - started
+
+    def _create_ksp(self) -> PETSc.KSP:
+        ksp = PETSc.KSP().create(self.layout.comm)
+        ksp.setOptionsPrefix(self.prefix)
+        ksp.setOperators(self.system.J, self.system.J)
+        ksp.setDM(self.system.dm)
+        if PETSc.Sys.getVersion() < (3, 25):
+            ksp.setDMActive(False)
+        else:
+            ksp.setDMActive(PETSc.KSP.DMActive.ALL, False)
+        ksp.setFromOptions()
+        ksp.setConvergenceHistory()
+        return ksp
+
+    def update(self, scene: Scene) -> None:
+        """Take the values of another scene of the same fields and sizes.
+
+        Collective. PETSc's objects are kept where the nonzero pattern allows it, else made anew.
+        """
+        started = time.perf_counter()
+        with together(self.layout.comm):
+            self.scene = scene if scene.rows is not None else scene.restrict(_ranges(self.layout))
+        try:
+            self.system.update(self.scene)
+        except PatternChanged:
+            mat_type = self.system.mat_type
+            self.ksp.destroy()
+            self.system = System(self.scene, self.layout, mat_type=mat_type)
+            self.ksp = self._create_ksp()
+        self._built_seconds = time.perf_counter() - started
+
+    def set_up(self) -> None:
+        """Set the preconditioner up, where it is not. Collective.
+
+        Raises:
+            SolveError: PETSc could not.
+            PetscFsError: an operator or option of a level is impossible.
+        """
+        started = time.perf_counter()
+        try:
+            self.ksp.setUp()
+        except PETSc.Error as e:
+            raise SolveError(f"set-up failed: {brief(e)}") from e
+        self._built_seconds += time.perf_counter() - started
+
+    def queried_options(self) -> None:
+        """Set an identical solver up and throw it away: for `petsc_fs.options.queried`. Collective."""
+        ksp = self._create_ksp()
+        try:
+            ksp.setUp()
+        except (PETSc.Error, PetscFsError):
+            pass
+        ksp.destroy()
+
+    def solve(self) -> Result:
+        """Solve for the right-hand side of the scene, from a zero initial guess. Collective.
+
+        A Krylov method that stops early is no error: see `Result.converged` and `Result.reason`.
+
+        Raises:
+            SolveError: PETSc failed on the way, or the solution is not finite.
+        """
+        self.set_up()
+        started = time.perf_counter()
+        try:
+            self.ksp.solve(self.system.b, self.x)
+        except PETSc.Error as e:
+            raise SolveError(f"solve failed: {brief(e)}") from e
+        solve_seconds = time.perf_counter() - started
+        result = self._judge(solve_seconds)
+        self._built_seconds = 0.0
+        return result
+
+    def _judge(self, solve_seconds: float) -> Result:
+        system, reason = self.system, reason_name(self.ksp)
+        residual = system.b.duplicate()
+        system.J.mult(self.x, residual)
+        residual.aypx(-1.0, system.b)
+        norms = system.field_norms(system.by_field(residual))
+        size = system.b.norm() or 1.0
+        relative = residual.norm() / size
+        residual.destroy()
+        if not np.isfinite(relative):
+            raise SolveError(f"the solution is not finite after {self.ksp.getIterationNumber()} iterations ({reason})")
+        tolerance = max(self.true_rtol, self.ksp.getTolerances()[1] / size)
+        solution = system.by_field(self.x)
+        return Result(
+            iterations=self.ksp.getIterationNumber(),
+            converged=bool(relative <= ROUNDING * tolerance),
+            reason=reason,
+            true_relative_residual=relative,
+            tolerance=tolerance,
+            residual_by_field={f: n / size for f, n in norms.items()},
+            error_by_field=self._errors(solution),
+            setup_seconds=self._built_seconds,
+            solve_seconds=solve_seconds,
+            solution=solution,
+        )
+
+    def _errors(self, solution: FieldArrays) -> dict[str, float]:
+        reference = self.scene.reference
+        if set(reference) != set(self.layout.fields):
+            return {}
+        error = self.system.field_norms({f: solution[f] - reference[f] for f in reference})
+        size = self.system.field_norms(reference)
+        return {f: error[f] / (size[f] or 1.0) for f in self.layout.fields}
+
+    def history(self) -> NDArray[np.float64]:
+        """Residual norms of the last solve, as the Krylov method saw them; the first is the initial one."""
+        return np.asarray(self.ksp.getConvergenceHistory())
+
+    def destroy(self) -> None:
+        """Free PETSc's objects. Collective; may be called twice."""
+        self.ksp.destroy()
+
+
+def _ranges(layout: Layout) -> dict[str, tuple[int, int]]:
+    return {f: layout.rows(f) for f in layout.fields}
+
+
+def reason_name(ksp: PETSc.KSP) -> str:
+    """Name of the reason why a KSP stopped, for example CONVERGED_RTOL."""
+    number = ksp.getConvergedReason()
+    names = {v: k for k, v in vars(PETSc.KSP.ConvergedReason).items() if isinstance(v, int)}
+    return names.get(number, str(number))
+
+
+def brief(error: PETSc.Error) -> str:
+    """One line of a PETSc error: its code's text and the innermost message."""
+    lines = [re.sub(r"^\[\d+\]\s*", "", line).strip() for line in str(error).splitlines()]
+    messages = [line for line in lines if line and not re.match(r"\w+\(\) (line|at)", line)]
+    return "; ".join(messages) or f"error code {error.ierr}"
+
+
+__all__ = ["Distribute", "Result", "Solver", "brief", "reason_name"]

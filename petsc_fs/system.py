@@ -1,0 +1,151 @@
+"""System: a scene as PETSc objects, namely a MatNest with one block per pair of fields, a vector and a DM."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from petsc_fs.dm import Blocks, Problem, field_dm
+from petsc_fs.errors import LayoutError, SceneError, together
+from petsc_fs.fixed_stress import analytic_coefficients
+from petsc_fs.layout import Layout
+from petsc_fs.scene import CSR, Scene
+
+FieldArrays = dict[str, NDArray[np.float64]]
+
+
+class PatternChanged(LayoutError):
+    """New values do not fit into the nonzero pattern of the old ones; build a new system."""
+
+
+class System:
+    """The linear system of one scene, distributed.
+
+    Attributes:
+        layout: distribution of the rows.
+        blocks: matrices by (row field, column field), AIJ with the fields' block sizes.
+        J: the Jacobian: a MatNest over `blocks` by reference, or one AIJ.
+        b: right-hand side, numbered as J: on each rank field by field.
+        dm: names the fields.
+    """
+
+    def __init__(self, scene: Scene, layout: Layout, *, mat_type: str = "nest") -> None:
+        """Build everything from the rows of this rank.
+
+        Collective on `layout.comm`.
+
+        Args:
+            scene: whose row ranges are those of `layout` on this rank.
+            layout: distribution of the rows.
+            mat_type: "nest", or "aij" for a copy in one matrix, as direct solvers need it.
+
+        Raises:
+            LayoutError: scene and layout differ.
+            SceneError: a block is too large for this PETSc.
+        """
+        self.layout = layout
+        self.mat_type = mat_type
+        fields = layout.fields
+        with together(layout.comm):
+            self._check(scene)
+            coefficients = analytic_coefficients(scene) if "mass" in fields else None
+        pairs = list(product(fields, fields))
+        entries = np.array([scene.blocks[rc].data.size if rc in scene.blocks else 0 for rc in pairs])
+        entries = layout.comm.allreduce(entries)
+        self.blocks: Blocks = {
+            rc: self._create_block(*rc, scene.blocks.get(rc))
+            for rc, n in zip(pairs, entries, strict=True)
+            if n or rc[0] == rc[1]
+        }
+        self._nest = PETSc.Mat().createNest(
+            [[self.blocks.get((r, c)) for c in fields] for r in fields], comm=layout.comm
+        )
+        self.J = self._nest if mat_type == "nest" else self._nest.convert("aij", PETSc.Mat())
+        self.b = self.J.createVecLeft()
+        problem = Problem(layout, self.blocks, scene.cell_centers, coefficients, scene.contact_state)
+        self.dm = field_dm(problem, [(f, (f,)) for f in fields])
+        self.set_rhs(scene.rhs)
+
+    def update(self, scene: Scene) -> None:
+        """Replace the values of matrix and right-hand side, keeping every PETSc object.
+
+        Collective. The material data of the fixed-stress diagonal are replaced too.
+
+        Raises:
+            PatternChanged: an entry is outside the nonzero pattern; the system is unusable then.
+            LayoutError: scene and layout differ.
+        """
+        problem: Problem = self.dm.getAppCtx()[0]
+        with together(self.layout.comm):
+            self._check(scene)
+            if "mass" in self.layout.fields:
+                problem.fixed_stress = analytic_coefficients(scene)
+            for rc, block in scene.blocks.items():
+                if block.data.size and rc not in self.blocks:
+                    raise PatternChanged(f"block {rc} was empty")
+            for rc, matrix in self.blocks.items():
+                _set_values(matrix, rc, scene.blocks.get(rc))
+        problem.contact_state = scene.contact_state
+        for matrix in self.blocks.values():
+            matrix.assemble()
+        self._nest.stateIncrease()
+        if self.J is not self._nest:
+            self._nest.convert("aij", out=self.J)
+        self.set_rhs(scene.rhs)
+
+    def set_rhs(self, rhs: Mapping[str, NDArray[np.float64]]) -> None:
+        """Set the right-hand side from the local rows of each field."""
+        self.b.setArray(np.concatenate([rhs[f] for f in self.layout.fields]))
+
+    def by_field(self, vector: PETSc.Vec) -> FieldArrays:
+        """The local rows of each field of a vector, copied."""
+        bounds = np.cumsum([self.layout.sizes(f)[0] for f in self.layout.fields])[:-1]
+        return dict(zip(self.layout.fields, np.split(vector.getArray().copy(), bounds), strict=True))
+
+    def field_norms(self, arrays: Mapping[str, NDArray[np.float64]]) -> dict[str, float]:
+        """Euclidean norm of each field over all ranks. Collective."""
+        squares = np.array([np.vdot(arrays[f], arrays[f]) for f in self.layout.fields])
+        return dict(zip(self.layout.fields, np.sqrt(self.layout.comm.allreduce(squares)).tolist(), strict=True))
+
+    def gather(self, arrays: Mapping[str, NDArray[np.float64]]) -> FieldArrays | None:
+        """All rows of each field in the scene's numbering, on rank 0; None elsewhere. Collective."""
+        parts = self.layout.comm.gather(dict(arrays))
+        if parts is None:
+            return None
+        return {f: np.concatenate([part[f] for part in parts]) for f in self.layout.fields}
+
+    def _check(self, scene: Scene) -> None:
+        for name in self.layout.fields:
+            if scene.sizes.get(name) != self.layout.sizes(name)[1] or scene.row_range(name) != self.layout.rows(name):
+                raise LayoutError(f"{name}: the rows of the scene are not those of the layout")
+        if set(scene.sizes) != set(self.layout.fields):
+            raise LayoutError(f"the scene has fields {scene.fields}, the layout {self.layout.fields}")
+        limit = np.iinfo(PETSc.IntType).max
+        for (r, c), block in scene.blocks.items():
+            if block.data.size > limit:
+                raise SceneError(f"block ({r}, {c}): {block.data.size} entries on a rank; use more ranks, or a PETSc with 64-bit indices")
+
+    def _create_block(self, r: str, c: str, block: CSR | None) -> PETSc.Mat:
+        sizes = (self.layout.sizes(r), self.layout.sizes(c))
+        if block is None:
+            block = CSR(np.zeros(sizes[0][0] + 1, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))
+        bsize = (self.layout.block_size(r), self.layout.block_size(c))
+        csr = (block.indptr.astype(PETSc.IntType), block.indices.astype(PETSc.IntType), block.data)
+        return PETSc.Mat().createAIJ(sizes, bsize=bsize, csr=csr, comm=self.layout.comm)
+
+
+def _set_values(matrix: PETSc.Mat, rc: tuple[str, str], block: CSR | None) -> None:
+    matrix.zeroEntries()
+    if block is None or not block.data.size:
+        return
+    matrix.setOption(PETSc.Mat.Option.NEW_NONZERO_LOCATION_ERR, True)
+    start = matrix.getOwnershipRange()[0]
+    # setValuesCSR numbers rows from the first local one
+    try:
+        matrix.setValuesCSR(block.indptr.astype(PETSc.IntType), block.indices.astype(PETSc.IntType), block.data)
+    except PETSc.Error as e:
+        raise PatternChanged(f"block {rc}: an entry is new (first local row {start})") from e
