@@ -259,6 +259,7 @@ def _report(
         "converged": result.converged,
         "reason": result.reason,
         "tolerance": result.tolerance,
+        "limited_by_rounding": result.limited_by_rounding,
         "true_relative_residual": result.true_relative_residual,
         "residual_by_field": result.residual_by_field,
         "error_by_field": result.error_by_field,

@@ -27,7 +27,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from petsc_fs.errors import LayoutError, SceneError
+from petsc_fs.errors import LayoutError, SceneError, UsageError
 from petsc_fs.fields import FIELD, FIELD_NAMES, in_order
 from petsc_fs.scene import CSR, Material, Metadata, Scene
 
@@ -45,29 +45,60 @@ def write(scene: Scene, path: str | os.PathLike[str], *, compression: str | None
         compression: an h5py filter, or None.
 
     Raises:
-        SceneError: the scene does not fit together, or the file cannot be written.
+        SceneError: the scene does not fit together.
+        UsageError: the file cannot be written.
     """
     target = Path(path)
     scene.validate()
     if scene.rows is not None and any(scene.row_range(f) != (0, n) for f, n in scene.sizes.items()):
         raise SceneError(f"{target}: only a whole scene can be written, this is the part of one rank")
+    options = {"compression": compression, "shuffle": True} if compression else {}
+    return _write_file(target, lambda file: _write(file, scene, options))
+
+
+def _write_file(target: Path, fill: Callable[[h5py.File], None]) -> Path:
+    """Write a file under a temporary name and rename it once it is complete."""
     try:
         handle, temporary = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
         os.close(handle)
     except OSError as e:
-        raise SceneError(f"{target}: cannot be written: {e.strerror}") from e
+        raise UsageError(f"{target}: cannot be written: {e.strerror}") from e
     try:
         with h5py.File(temporary, "w") as file:
-            _write(file, scene, {"compression": compression, "shuffle": True} if compression else {})
+            fill(file)
         umask = os.umask(0)
         os.umask(umask)
         Path(temporary).chmod(0o666 & ~umask)
         os.replace(temporary, target)
     except OSError as e:
-        raise SceneError(f"{target}: cannot be written: {e}") from e
+        raise UsageError(f"{target}: cannot be written: {e}") from e
     finally:
         Path(temporary).unlink(missing_ok=True)
     return target
+
+
+def write_solution(solution: Mapping[str, Any], path: str | os.PathLike[str], scene: Scene) -> Path:
+    """Write a solution, one dataset per field in the scene's numbering and units.
+
+    Args:
+        solution: all rows of each field.
+        path: of the file, replaced if it exists.
+        scene: that it solves; names where it comes from.
+
+    Raises:
+        UsageError: the file cannot be written.
+    """
+
+    def fill(file: h5py.File) -> None:
+        file.attrs["encoding-type"] = "petsc_fs solution"
+        file.attrs["encoding-version"] = VERSION
+        file.attrs["model"] = scene.metadata.model
+        file.attrs["time_step_index"] = scene.metadata.time_step_index
+        file.attrs["newton_index"] = scene.metadata.newton_index
+        for name, values in solution.items():
+            file.create_dataset(name, data=values).attrs["unit"] = FIELD[name].unit
+
+    return _write_file(Path(path), fill)
 
 
 def _write(file: h5py.File, scene: Scene, options: dict[str, Any]) -> None:

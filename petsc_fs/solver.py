@@ -18,8 +18,8 @@ from petsc_fs.layout import Distribute, Layout
 from petsc_fs.scene import Scene
 from petsc_fs.system import FieldArrays, PatternChanged, System
 
-ROUNDING = 1.01
-"""Factor by which the true residual may exceed the tolerance that the recursive one has met."""
+ROUNDING_UNITS = 10
+"""A residual this many times the rounding level of the system cannot be told from zero."""
 
 
 @dataclass
@@ -31,7 +31,10 @@ class Result:
         converged: whether the true residual of the untransformed system meets the tolerance.
         reason: PETSc's name of the reason why the Krylov method stopped.
         true_relative_residual: |b - J x| / |b|.
-        tolerance: what `true_relative_residual` is held against.
+        tolerance: what `true_relative_residual` is held against: the larger of the relative
+            tolerance and the absolute one / |b|; or, where rounding forbids to meet that, ten units
+            of rounding, |J| |x| + |b| taken entry by entry.
+        limited_by_rounding: whether that last resort was needed.
         residual_by_field: |b - J x| restricted to each field / |b|.
         error_by_field: |x - reference| / |reference| per field, where a reference is known; the
             absolute error where the reference is zero.
@@ -45,6 +48,7 @@ class Result:
     reason: str
     true_relative_residual: float
     tolerance: float
+    limited_by_rounding: bool
     residual_by_field: dict[str, float]
     error_by_field: dict[str, float]
     setup_seconds: float
@@ -191,12 +195,18 @@ class Solver:
             raise SolveError(f"the solution is not finite after {self.ksp.getIterationNumber()} iterations ({reason})")
         tolerance = max(self.true_rtol, self.ksp.getTolerances()[1] / size)
         solution = system.by_field(self.x)
+        limited = False
+        if relative > tolerance and self.ksp.getConvergedReason() > 0:
+            floor = ROUNDING_UNITS * system.rounding_level(solution) / size
+            limited = bool(relative <= floor)
+            tolerance = floor if limited else tolerance
         return Result(
             iterations=self.ksp.getIterationNumber(),
-            converged=bool(relative <= ROUNDING * tolerance),
+            converged=bool(relative <= tolerance),
             reason=reason,
             true_relative_residual=relative,
             tolerance=tolerance,
+            limited_by_rounding=limited,
             residual_by_field={f: n / size for f, n in norms.items()},
             error_by_field=self._errors(solution),
             setup_seconds=self._built_seconds,

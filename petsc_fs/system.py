@@ -111,6 +111,20 @@ class System:
         squares = np.array([np.vdot(arrays[f], arrays[f]) for f in self.layout.fields])
         return dict(zip(self.layout.fields, np.sqrt(self.layout.comm.allreduce(squares)).tolist(), strict=True))
 
+    def rounding_level(self, solution: Mapping[str, NDArray[np.float64]]) -> float:
+        """Unit roundoff times the norm of |J| |x| + |b|: below this a residual says nothing.
+
+        Collective. Gathers the solution on every rank and copies one block at a time.
+        """
+        magnitude = {f: np.abs(v) for f, v in self.by_field(self.b).items()}
+        whole = {f: np.abs(np.concatenate(self.layout.comm.allgather(v))) for f, v in solution.items()}
+        for (r, c), block in self.blocks.items():
+            indptr, indices, values = block.getValuesCSR()
+            sums = np.concatenate([[0.0], np.cumsum(np.abs(values) * whole[c][indices])])
+            magnitude[r] += np.diff(sums[indptr])
+        norms = self.field_norms(magnitude)
+        return float(np.finfo(np.float64).eps * np.linalg.norm(list(norms.values())))
+
     def gather(self, arrays: Mapping[str, NDArray[np.float64]]) -> FieldArrays | None:
         """All rows of each field in the scene's numbering, on rank 0; None elsewhere. Collective."""
         parts = self.layout.comm.gather(dict(arrays))

@@ -9,7 +9,7 @@ from petsc4py import PETSc
 
 from petsc_fs.dm import Blocks, Members, Problem, field_dm
 from petsc_fs.errors import LayoutError, SceneError, UsageError, together
-from petsc_fs.fields import MECHANICS
+from petsc_fs.fields import MECHANICS, in_order
 from petsc_fs.pc.wrapper import WrapperPC, choice
 from petsc_fs.scene import CONTACT_STATES
 
@@ -66,7 +66,7 @@ class ContactTransform(WrapperPC):
         """Blocks of J~ in the row and column of contact, of S^1 elsewhere."""
         D_inverse = block_diagonal_inverse(J["intf_force", "intf_force"], "D_22, block of intf_force", problem)
         S = dict(J)
-        others = {name for pair in J for name in pair}
+        others = in_order(name for pair in J for name in pair)  # the same order on all ranks
         if self.side == "right":
             self._transform = D_inverse.matMult(J["intf_force", "contact"])
             changed = {(r, "contact"): (J[r, "intf_force"], self._transform) for r in others if (r, "intf_force") in J}

@@ -29,11 +29,11 @@ Floats = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 BUNDLED = {
-    "model1": (2.0, "5:0"),
+    "model1": (2.0, "3:0"),
     "model2": (2.0, "3:2"),
     "model3": (0.25, "2:1"),
-    "biot": (2.0, "2:0"),
-    "flow": (2.0, "2:0"),
+    "biot": (2.0, "1:0"),
+    "flow": (2.0, "1:0"),
     "contact": (2.0, "4:1"),
 }
 """Refinement and Newton step (see `Steps.parse`) of each scene that comes with the package."""
@@ -233,8 +233,8 @@ def export_bundled(
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `run`; needs no PorePy."""
     parser.add_argument("model", choices=list(CASES), help="name of the model")
-    parser.add_argument("--refinement", type=float, default=1.0, metavar="G", help="cells are 100 m / G wide")
-    parser.add_argument("--directory", default=".", metavar="DIR", help="where the scenes go")
+    parser.add_argument("--refine", dest="refinement", type=float, default=1.0, metavar="G", help="cells are 100 m / G wide")
+    parser.add_argument("--out", dest="directory", default=".", metavar="DIR", help="where the scenes go")
     parser.add_argument(
         "--steps",
         default="last",
