@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from petsc_fs.errors import PetscFsError, SceneError, UsageError, together
-from petsc_fs.fields import FIELD, in_order
+from petsc_fs.fields import in_order
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -175,7 +175,15 @@ def _solve(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> i
 
     everything = solver.system.gather(result.solution)
     if comm.rank == 0:
-        report = _report(scene, solver, result, path, options_file, read_seconds, PETSc.Options().getAll())
+        report = _report(
+            scene,
+            solver,
+            result,
+            path=path,
+            options_file=options_file,
+            read_seconds=read_seconds,
+            database=PETSc.Options().getAll(),
+        )
         if args.report is not None:
             _write_text(args.report, json.dumps(report, indent=2) + "\n")
         if args.save is not None and everything is not None:
@@ -202,7 +210,7 @@ def _with_options_file(petsc: list[str], fields: tuple[str, ...]) -> tuple[list[
         files = [options.default_for(fields)]
         petsc = ["-options_file", str(files[0]), *petsc]
     for file in files:
-        options.check_syntax(file)
+        options.parse(file)
     header = options.read_header(files[0])
     if not header.fits(fields):
         raise UsageError(
@@ -233,6 +241,7 @@ def _report(
     scene: Scene,
     solver: Solver,
     result: Result,
+    *,
     path: Path,
     options_file: Path,
     read_seconds: float,
@@ -282,14 +291,14 @@ def _inspect(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) ->
     from petsc_fs import hdf5
     from petsc_fs.tables import inspect_table
 
-    if comm.rank:
-        return 0
-    scene = hdf5.read(find_scene(args.scene))
-    print(inspect_table(scene), flush=True)
-    if args.plot is not None:
-        from petsc_fs.plot import plot_blocks
+    with together(comm):
+        if comm.rank == 0:
+            scene = hdf5.read(find_scene(args.scene))
+            print(inspect_table(scene), flush=True)
+            if args.plot is not None:
+                from petsc_fs.plot import plot_blocks
 
-        print(f"block structure drawn in {plot_blocks(scene, args.plot)}")
+                print(f"block structure drawn in {plot_blocks(scene, args.plot)}")
     return 0
 
 
@@ -315,7 +324,8 @@ def _export(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
         raise UsageError("export runs on one rank, as PorePy does; start it without mpiexec")
     from petsc_fs.porepy.export import run
 
-    return int(run(args) or 0)
+    run(args)
+    return 0
 
 
 def find_scene(name: str) -> Path:

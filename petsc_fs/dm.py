@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from petsc_fs.layout import Layout
+from petsc_fs.scene import Integers
 
 Members = Sequence[tuple[str, tuple[str, ...]]]
 """Fields as a DM lists them: name and the fields of the table it is made of, in the table's order."""
@@ -42,7 +43,7 @@ class Problem:
     blocks: Blocks
     cell_centers: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     fixed_stress: NDArray[np.float64] | None = None
-    contact_state: NDArray[np.integer] | None = None
+    contact_state: Integers | None = None
 
 
 def field_dm(problem: Problem, members: Members) -> PETSc.DMShell:

@@ -70,7 +70,7 @@ def _write_file(target: Path, fill: Callable[[h5py.File], None]) -> Path:
         os.umask(umask)
         Path(temporary).chmod(0o666 & ~umask)
         os.replace(temporary, target)
-    except OSError as e:
+    except (OSError, RuntimeError, TypeError, ValueError) as e:
         raise UsageError(f"{target}: cannot be written: {e}") from e
     finally:
         Path(temporary).unlink(missing_ok=True)
@@ -126,6 +126,7 @@ def _write(file: h5py.File, scene: Scene, options: dict[str, Any]) -> None:
         put(group, "rhs", scene.rhs[name])
         for what, values in _known_arrays(scene, name).items():
             put(group, what, values)
+    file.create_group("blocks")
     for (r, c), block in scene.blocks.items():
         group = file.create_group(f"blocks/{r}/{c}")
         group.attrs["encoding-type"] = "csr_matrix"
@@ -221,7 +222,7 @@ def _open(path: Path) -> Iterator[h5py.File]:
             raise type(e)(f"{path}: {e}") from e
         except KeyError as e:
             raise SceneError(f"{path}: the scene is incomplete: {e.args[0]}") from e
-        except (OSError, RuntimeError, TypeError, ValueError) as e:
+        except (OSError, RuntimeError, TypeError, ValueError, AttributeError, IndexError) as e:
             raise SceneError(f"{path}: the scene is damaged ({e}); copy or export it again") from e
 
 
@@ -237,40 +238,50 @@ def _header(file: h5py.File) -> tuple[int, dict[str, int]]:
     if number < VERSION:
         raise SceneError(f"written in version {number} of the format, which is no longer read; export it again")
     dimension = int(file.attrs["dimension"])
+    if dimension not in (2, 3):
+        raise SceneError(f"dimension: expected 2 or 3, found {dimension}")
+    for name in file.attrs["fields"]:
+        if name not in file["fields"]:
+            raise SceneError(f"the scene is incomplete: field {name!r} has no group")
     sizes: dict[str, int] = {}
     for name in file["fields"]:
         if name not in FIELD:
             raise LayoutError(f"unknown field {name!r}; fields are {', '.join(FIELD_NAMES)}")
         sizes[name] = int(file["fields"][name].attrs["size"])
         bs = int(file["fields"][name].attrs["block_size"])
-        if dimension in (2, 3) and bs != FIELD[name].block_size(dimension):
+        if bs != FIELD[name].block_size(dimension):
             raise LayoutError(
                 f"{name}: block_size is {bs}, expected {FIELD[name].block_size(dimension)} in {dimension}D"
             )
+        if sizes[name] < 0 or sizes[name] % bs:
+            raise LayoutError(f"{name}: {sizes[name]} rows is not a multiple of block size {bs}")
     return dimension, {name: sizes[name] for name in in_order(sizes)}
 
 
-def _read(
-    file: h5py.File, dimension: int, sizes: dict[str, int], rows: Mapping[str, tuple[int, int]]
-) -> Scene:
+def _read(file: h5py.File, dimension: int, sizes: dict[str, int], rows: Mapping[str, tuple[int, int]]) -> Scene:
     found: dict[str, dict[str, Any]] = {name: {} for name in ("rhs", "reference", *PER_CELL)}
-    for name in sizes:
+    for name, size in sizes.items():
         group = file["fields"][name]
         bs = FIELD[name].block_size(dimension)
         for what, store in found.items():
             if what not in group:
                 continue
             per_cell = what in PER_CELL
-            expected = sizes[name] // bs if per_cell else sizes[name]
+            expected = size // bs if per_cell else size
             if group[what].shape[:1] != (expected,):
-                raise LayoutError(f"{name}: {what} has {group[what].shape[0]} entries, expected {expected}")
+                raise LayoutError(f"{name}: {what} has {len(group[what])} entries, expected {expected}")
             a, b = rows[name]
             values = group[what][a // bs : b // bs] if per_cell else group[what][a:b]
-            store[name] = values if what in ("cell_dimension", "contact_state") else np.asarray(values, dtype=np.float64)
+            store[name] = (
+                values if what in ("cell_dimension", "contact_state") else np.asarray(values, dtype=np.float64)
+            )
     blocks: dict[tuple[str, str], CSR] = {}
-    for r in sizes:
-        for c in file["blocks"][r] if r in file["blocks"] else ():
-            blocks[r, c] = _read_block(file["blocks"][r][c], f"block ({r}, {c})", sizes[r], *rows[r])
+    for r, row in file["blocks"].items():
+        for c in row:
+            what = f"block ({r}, {c})"
+            if r not in sizes or c not in sizes:
+                raise LayoutError(f"{what}: the scene has no field {r if r not in sizes else c!r}")
+            blocks[r, c] = _read_block(row[c], what, (sizes[r], sizes[c]), *rows[r])
     return Scene(
         dimension=dimension,
         sizes=sizes,
@@ -281,34 +292,47 @@ def _read(
         cell_volumes=found["cell_volumes"],
         cell_dimension=found["cell_dimension"].get("mass"),
         contact_state=found["contact_state"].get("contact"),
-        material=_read_material(file, rows["mass"]) if "material" in file and "mass" in sizes else None,
+        material=_read_material(file, sizes["mass"], rows["mass"]) if "material" in file and "mass" in sizes else None,
         metadata=Metadata(
-            **{k: _plain(file.attrs[k]) for k in ("model", "time_step_index", "newton_index", "time")},
+            model=str(file.attrs["model"]),
+            time_step_index=int(file.attrs["time_step_index"]),
+            newton_index=int(file.attrs["newton_index"]),
+            time=float(file.attrs["time"]),
             units={k: float(v) for k, v in file["units"].attrs.items()},
             producers={k: str(v) for k, v in file["producers"].attrs.items()},
         ),
     )
 
 
-def _read_block(group: h5py.Group, what: str, size: int, start: int, stop: int) -> CSR:
-    if group["indptr"].shape != (size + 1,):
-        raise LayoutError(f"{what}: indptr has {group['indptr'].size} entries, expected {size + 1}")
-    indptr = group["indptr"][start : stop + 1].astype(np.int64)
+def _read_block(group: h5py.Group, what: str, shape: tuple[int, int], start: int, stop: int) -> CSR:
+    encoding = group.attrs["encoding-type"]
+    if encoding != "csr_matrix":
+        raise LayoutError(f"{what}: encoding-type is {encoding!r}, expected 'csr_matrix'")
+    if tuple(group.attrs["shape"]) != shape:
+        raise LayoutError(f"{what}: shape is {tuple(group.attrs['shape'])}, expected {shape}")
+    pointers, columns, values = (group[name] for name in CSR._fields)
+    if pointers.dtype.kind not in "iu" or columns.dtype.kind not in "iu":
+        raise LayoutError(f"{what}: indptr and indices must be integers")
+    if pointers.shape != (shape[0] + 1,):
+        raise LayoutError(f"{what}: indptr has {pointers.size} entries, expected {shape[0] + 1}")
+    if columns.shape != values.shape:
+        raise LayoutError(f"{what}: {columns.size} indices but {values.size} values")
+    indptr = pointers[start : stop + 1].astype(np.int64)
     a, b = int(indptr[0]), int(indptr[-1])
-    if not 0 <= a <= b <= min(group["indices"].size, group["data"].size):
-        raise LayoutError(f"{what}: indptr runs to {b}, but there are {group['data'].size} values")
-    if stop == size and b != group["data"].size:
-        raise LayoutError(f"{what}: indptr ends at {b}, but there are {group['data'].size} values")
-    return CSR(indptr - a, group["indices"][a:b], np.asarray(group["data"][a:b], dtype=np.float64))
+    if start == 0 and a != 0:
+        raise LayoutError(f"{what}: indptr starts at {a}, expected 0")
+    if not 0 <= a <= b <= values.size:
+        raise LayoutError(f"{what}: indptr runs to {b}, but there are {values.size} values")
+    if stop == shape[0] and b != values.size:
+        raise LayoutError(f"{what}: indptr ends at {b}, but there are {values.size} values")
+    return CSR(indptr - a, columns[a:b], np.asarray(values[a:b], dtype=np.float64))
 
 
-def _read_material(file: h5py.File, rows: tuple[int, int]) -> Material:
+def _read_material(file: h5py.File, size: int, rows: tuple[int, int]) -> Material:
     group = file["material"]
     names = [a.name for a in attributes(Material) if a.name != "time_step"]
+    for name in group:
+        if group[name].shape != (size,):
+            raise LayoutError(f"material: {name} has shape {group[name].shape}, expected {(size,)}")
     values = {n: group[n][slice(*rows)] if n in group else float(group.attrs[n]) for n in names}
     return Material(**values, time_step=float(group.attrs["time_step"]))
-
-
-def _plain(value: Any) -> Any:
-    """A Python value from an attribute."""
-    return value.item() if isinstance(value, np.generic) else value

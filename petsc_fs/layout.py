@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from petsc_fs.errors import LayoutError
 from petsc_fs.fields import FIELD, in_order
@@ -41,7 +41,7 @@ class Layout:
         return cls.from_cells(comm, dimension, counts)
 
     @classmethod
-    def from_cells(cls, comm: MPI.Intracomm, dimension: int, cells: Mapping[str, Sequence[int]]) -> Layout:
+    def from_cells(cls, comm: MPI.Intracomm, dimension: int, cells: Mapping[str, ArrayLike]) -> Layout:
         """Given the number of cells of each field on each rank, the same on all ranks.
 
         Raises:
@@ -73,7 +73,3 @@ class Layout:
         """Number of rows of a field on this rank, and on all."""
         start, stop = self.rows(name)
         return stop - start, int(self.offsets[name][-1])
-
-
-Distribute = Callable[["MPI.Intracomm", int, Mapping[str, int]], Layout]
-"""How rows are distributed, given communicator, dimension and sizes: for example `Layout.contiguous`."""

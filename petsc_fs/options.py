@@ -49,12 +49,14 @@ class OptionsFile:
         purpose: first line.
         fields: fields that a scene must have, no more and no fewer; empty if any will do.
         default: whether `solve` takes it when none is named.
+        not_for: bundled scenes it is known to fail on.
     """
 
     path: Path
     purpose: str
     fields: tuple[str, ...]
     default: bool
+    not_for: tuple[str, ...]
 
     def fits(self, fields: Iterable[str]) -> bool:
         """Whether a scene with these fields can be solved by the file."""
@@ -62,11 +64,17 @@ class OptionsFile:
 
 
 def read_header(path: Path) -> OptionsFile:
-    """Header of an options file: comment lines `# fields: ...` and `# default: yes`."""
+    """Header of an options file: comment lines `# fields:`, `# default: yes` and `# not_for:`."""
     comments = [line[1:].strip() for line in _text(path).splitlines() if line.startswith("#")]
-    entries = dict(re.match(r"(\w+): *(.*)", c).groups() for c in comments if re.match(r"\w+: ", c))  # type: ignore[union-attr]
+    entries = {m[1]: m[2] for m in (re.match(r"(\w+): *(.*)", c) for c in comments) if m}
     fields = in_order(f for f in re.findall(r"\w+", entries.get("fields", "")) if f in FIELD_NAMES)
-    return OptionsFile(path, comments[0] if comments else "", fields, entries.get("default") == "yes")
+    return OptionsFile(
+        path,
+        purpose=comments[0] if comments else "",
+        fields=fields,
+        default=entries.get("default") == "yes",
+        not_for=tuple(re.findall(r"\w+", entries.get("not_for", ""))),
+    )
 
 
 def shipped() -> list[OptionsFile]:
@@ -87,27 +95,51 @@ def default_for(fields: Iterable[str]) -> Path:
     raise UsageError(f"no default solver for the fields {', '.join(names)}: name one with -options_file")
 
 
-def check_syntax(path: Path) -> None:
-    """Find what PETSc would stop at, with the line.
+def parse(path: Path) -> dict[str, str | None]:
+    """Options of a file by full name, without the dash; None where an option has no value.
 
     Raises:
-        UsageError: a line is no option, or prefixes do not pair up.
+        UsageError: PETSc would stop at a line (it is no option, or prefixes do not pair up).
     """
-    depth = 0
+    found: dict[str, str | None] = {}
+    prefixes = [""]
     for number, raw in enumerate(_text(path).splitlines(), start=1):
-        line = raw.split("#")[0].strip()
-        if not line:
+        name, *values = raw.split("#")[0].split() or [""]
+        if not name:
             continue
-        words = line.split()
-        if not re.match(r"-[A-Za-z_]", words[0]):
-            raise UsageError(f"{path}:{number}: {words[0]!r} is not an option; options start with '-'")
-        if words[0] == "-prefix_push" and len(words) < 2:
-            raise UsageError(f"{path}:{number}: -prefix_push without a prefix")
-        depth += {"-prefix_push": 1, "-prefix_pop": -1}.get(words[0], 0)
-        if depth < 0:
-            raise UsageError(f"{path}:{number}: -prefix_pop without a -prefix_push before it")
-    if depth:
-        raise UsageError(f"{path}: {depth} -prefix_push without a -prefix_pop")
+        if not re.match(r"-[A-Za-z_]", name):
+            raise UsageError(f"{path}:{number}: {name!r} is not an option; options start with '-'")
+        if name == "-prefix_push":
+            if not values:
+                raise UsageError(f"{path}:{number}: -prefix_push without a prefix")
+            prefixes.append(prefixes[-1] + values[0])
+        elif name == "-prefix_pop":
+            prefixes.pop()
+            if not prefixes:
+                raise UsageError(f"{path}:{number}: -prefix_pop without a -prefix_push before it")
+        else:
+            found[prefixes[-1] + name[1:]] = " ".join(values) or None
+    if len(prefixes) > 1:
+        raise UsageError(f"{path}: {len(prefixes) - 1} -prefix_push without a -prefix_pop")
+    return found
+
+
+def insert(path: Path, prefix: str = "") -> None:
+    """Put the options of a file into PETSc's database, except those that are set there already. Local.
+
+    Args:
+        path: of the options file.
+        prefix: put before each name.
+
+    Raises:
+        UsageError: see `parse`.
+    """
+    from petsc4py import PETSc
+
+    database = PETSc.Options()
+    for name, value in parse(path).items():
+        if not database.hasName(prefix + name):
+            database.setValue(prefix + name, value)
 
 
 def _text(path: Path) -> str:

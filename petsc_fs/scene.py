@@ -152,10 +152,18 @@ class Scene:
 
         Raises:
             LayoutError: a row or column belongs to no field or to two, or rows and columns of a
-                field differ in number.
+                field differ in number, or matrix and right-hand side do.
         """
         b = np.asarray(rhs, dtype=np.float64)
         n = b.size
+        if getattr(matrix, "format", "csr") != "csr":
+            raise LayoutError(f"matrix: expected compressed rows (csr), found {matrix.format}")
+        if b.ndim != 1 or np.size(matrix.indptr) != n + 1:
+            raise LayoutError(f"matrix has {np.size(matrix.indptr) - 1} rows, rhs has shape {b.shape}")
+        if np.size(matrix.indices) and not (0 <= np.min(matrix.indices) and np.max(matrix.indices) < n):
+            raise LayoutError(f"matrix: a column number is outside 0:{n}")
+        if columns is not None and set(columns) != set(fields):
+            raise LayoutError(f"columns are given for {', '.join(columns)}; rows for {', '.join(fields)}")
         names = in_order(fields)
         for unknown in set(fields) - set(FIELD_NAMES):
             raise LayoutError(f"unknown field {unknown!r}; fields are {', '.join(FIELD_NAMES)}")
@@ -163,16 +171,14 @@ class Scene:
         col_ids = {f: _indices(columns[f], n) for f in names} if columns is not None else row_ids
         for f in names:
             if row_ids[f].size != col_ids[f].size:
-                raise LayoutError(
-                    f"{f}: {row_ids[f].size} rows but {col_ids[f].size} columns; they must pair up"
-                )
+                raise LayoutError(f"{f}: {row_ids[f].size} rows but {col_ids[f].size} columns; they must pair up")
         _inverse(row_ids, n, "row")
         owner, local = _inverse(col_ids, n, "column")
 
         indptr = np.asarray(matrix.indptr, dtype=np.int64)
         blocks: dict[tuple[str, str], CSR] = {}
         for r in names:
-            take, counts = _gather(indptr, row_ids[r])
+            take, counts = gather_rows(indptr, row_ids[r])
             cols = np.asarray(matrix.indices)[take]
             data = np.asarray(matrix.data, dtype=np.float64)[take]
             row_of = np.repeat(np.arange(row_ids[r].size), counts)
@@ -225,6 +231,9 @@ class Scene:
                 self._check_length(name, "cell_centers", self.cell_centers[name], cells, 3)
             if name in self.cell_volumes:
                 self._check_length(name, "cell_volumes", self.cell_volumes[name], cells)
+        for what in ("rhs", "reference", "cell_centers", "cell_volumes"):
+            for name in set(getattr(self, what)) - set(self.sizes):
+                raise LayoutError(f"{what}: the scene has no field {name!r}")
         for (r, c), block in self.blocks.items():
             self._check_block(r, c, block)
         self._check_cell_data()
@@ -245,11 +254,11 @@ class Scene:
             if name not in self.sizes:
                 raise LayoutError(f"block ({r}, {c}): the scene has no field {name!r}")
         start, stop = self.row_range(r)
+        if block.indptr.dtype.kind not in "iu" or block.indices.dtype.kind not in "iu":
+            raise LayoutError(f"block ({r}, {c}): indptr and indices must be integers")
         if block.indptr.shape != (stop - start + 1,):
-            raise LayoutError(
-                f"block ({r}, {c}): indptr has {block.indptr.size} entries, expected {stop - start + 1}"
-            )
-        if block.indptr[0] != 0 or (np.diff(block.indptr) < 0).any():
+            raise LayoutError(f"block ({r}, {c}): indptr has {block.indptr.size} entries, expected {stop - start + 1}")
+        if block.indptr[0] != 0 or (block.indptr[1:] < block.indptr[:-1]).any():
             raise LayoutError(f"block ({r}, {c}): indptr must start at 0 and not decrease")
         if not block.indptr[-1] == block.indices.size == block.data.size:
             raise LayoutError(
@@ -259,7 +268,7 @@ class Scene:
         if block.indices.size and not (0 <= block.indices.min() and block.indices.max() < self.sizes[c]):
             raise LayoutError(f"block ({r}, {c}): a column number is outside 0:{self.sizes[c]}")
         if block.indices.size > 1:
-            falls = np.diff(block.indices) <= 0
+            falls = block.indices[1:] <= block.indices[:-1]
             falls[block.indptr[1:-1][(block.indptr[1:-1] > 0) & (block.indptr[1:-1] < block.indices.size)] - 1] = False
             if falls.any():
                 raise LayoutError(f"block ({r}, {c}): columns of a row must increase, without duplicates")
@@ -298,9 +307,15 @@ class Scene:
 
         Args:
             rows: per field a half-open range of global rows, whole cells.
+
+        Raises:
+            LayoutError: a range is missing, outside the scene or cuts through a cell.
         """
         if self.rows is not None:
             raise LayoutError("restrict: the scene is already the part of one rank")
+        for name, size in self.sizes.items():
+            if name not in rows or not 0 <= rows[name][0] <= rows[name][1] <= size:
+                raise LayoutError(f"{name}: row range {rows.get(name)} is not inside 0:{size}")
 
         def cells(name: str) -> slice:
             bs = self.block_size(name)
@@ -362,11 +377,11 @@ def _inverse(ids: Mapping[str, Integers], n: int, what: str) -> tuple[Integers, 
     return owner, local
 
 
-def _gather(indptr: Integers, rows: Integers) -> tuple[Integers, Integers]:
+def gather_rows(indptr: Integers, rows: Integers) -> tuple[Integers, Integers]:
     """Positions of all entries of the given rows, row by row, and the number of entries of each."""
     counts = np.diff(indptr)[rows]
-    offset = np.concatenate([[0], np.cumsum(counts)[:-1]]) if rows.size else np.zeros(0, dtype=np.int64)
-    return np.repeat(indptr[rows] - offset, counts) + np.arange(counts.sum()), counts
+    offset = np.cumsum(counts) - counts
+    return np.asarray(np.repeat(indptr[rows] - offset, counts) + np.arange(counts.sum())), counts
 
 
 def _sorted_rows(rows: Integers, cols: Integers, data: Floats, n: int) -> CSR:

@@ -10,11 +10,12 @@ import weakref
 from dataclasses import dataclass, field
 
 import numpy as np
+from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from petsc_fs.errors import PetscFsError, SolveError, UsageError, together
-from petsc_fs.layout import Distribute, Layout
+from petsc_fs.layout import Layout
 from petsc_fs.scene import Scene
 from petsc_fs.system import FieldArrays, PatternChanged, System
 
@@ -65,6 +66,7 @@ def _destroy_live() -> None:
     """Free what Python PCs hold while Python still runs: PetscFinalize comes after it."""
     for solver in sorted(_live, key=lambda s: s._number):
         solver.destroy()
+    PETSc.garbage_cleanup()
 
 
 class Solver:
@@ -75,14 +77,16 @@ class Solver:
         -petsc_fs_true_rtol r: relative true residual that counts as converged; default -ksp_rtol.
     """
 
-    def __init__(self, scene: Scene, comm: PETSc.Comm | None = None, *, layout: Layout | None = None, prefix: str = "") -> None:
+    def __init__(
+        self, scene: Scene, comm: MPI.Intracomm | None = None, *, layout: Layout | None = None, prefix: str = ""
+    ) -> None:
         """Build the system; nothing is factored yet.
 
         Collective.
 
         Args:
             scene: all rows on every rank, or the rows of this rank as `layout` has them.
-            comm: communicator, default PETSC_COMM_WORLD.
+            comm: communicator, default MPI_COMM_WORLD.
             layout: distribution of rows; default contiguous.
             prefix: of all options of this solver, including its own.
 
@@ -90,11 +94,10 @@ class Solver:
             SceneError: the scene does not fit together.
             UsageError: an option has an impossible value.
         """
-        from mpi4py import MPI
-
-        mpi = (comm or PETSc.COMM_WORLD).tompi4py() if not isinstance(comm, MPI.Comm) else comm
+        mpi = comm or MPI.COMM_WORLD
         started = time.perf_counter()
         self.prefix = prefix
+        self.ksp: PETSc.KSP | None = None
         self._number = next(_numbers)
         _live.add(self)
         self.layout = layout or Layout.contiguous(mpi, scene.dimension, scene.sizes)
@@ -150,6 +153,7 @@ class Solver:
         started = time.perf_counter()
         try:
             self.ksp.setUp()
+            set_up_leaves(self.ksp.getPC())
         except PETSc.Error as e:
             raise SolveError(f"set-up failed: {brief(e)}") from e
         self._built_seconds += time.perf_counter() - started
@@ -192,11 +196,15 @@ class Solver:
         relative = residual.norm() / size
         residual.destroy()
         if not np.isfinite(relative):
-            raise SolveError(f"the solution is not finite after {self.ksp.getIterationNumber()} iterations ({reason})")
+            hint = "; a factorisation broke down: see -ksp_view, and for MUMPS raise -mat_mumps_icntl_14 on its level"
+            raise SolveError(
+                f"the solution is not finite after {self.ksp.getIterationNumber()} iterations ({reason})"
+                + (hint if "PC" in reason else "")
+            )
         tolerance = max(self.true_rtol, self.ksp.getTolerances()[1] / size)
         solution = system.by_field(self.x)
         limited = False
-        if relative > tolerance and self.ksp.getConvergedReason() > 0:
+        if relative > tolerance:
             floor = ROUNDING_UNITS * system.rounding_level(solution) / size
             limited = bool(relative <= floor)
             tolerance = floor if limited else tolerance
@@ -228,7 +236,23 @@ class Solver:
 
     def destroy(self) -> None:
         """Free PETSc's objects. Collective; may be called twice."""
-        self.ksp.destroy()
+        if self.ksp is not None:
+            self.ksp.destroy()
+            self.ksp = None
+
+
+def set_up_leaves(pc: PETSc.PC) -> None:
+    """Set up what PCFIELDSPLIT leaves to the first application, so that set-up time holds all of it. Collective."""
+    if pc.getType() == PETSc.PC.Type.FIELDSPLIT:
+        for ksp in pc.getFieldSplitSubKSP():
+            ksp.setUp()
+            set_up_leaves(ksp.getPC())
+    elif pc.getType() == PETSc.PC.Type.PYTHON:
+        inner = getattr(pc.getPythonContext(), "inner", None)
+        if inner is not None:
+            set_up_leaves(inner)
+    else:
+        pc.setUpOnBlocks()
 
 
 def _ranges(layout: Layout) -> dict[str, tuple[int, int]]:
@@ -239,7 +263,7 @@ def reason_name(ksp: PETSc.KSP) -> str:
     """Name of the reason why a KSP stopped, for example CONVERGED_RTOL."""
     number = ksp.getConvergedReason()
     names = {v: k for k, v in vars(PETSc.KSP.ConvergedReason).items() if isinstance(v, int)}
-    return names.get(number, str(number))
+    return str(names.get(number, number))
 
 
 def brief(error: PETSc.Error) -> str:
@@ -247,6 +271,3 @@ def brief(error: PETSc.Error) -> str:
     lines = [re.sub(r"^\[\d+\]\s*", "", line).strip() for line in str(error).splitlines()]
     messages = [line for line in lines if line and not re.match(r"\w+\(\) (line|at)", line)]
     return "; ".join(messages) or f"error code {error.ierr}"
-
-
-__all__ = ["Distribute", "Result", "Solver", "brief", "reason_name"]

@@ -141,7 +141,10 @@ class System:
         limit = np.iinfo(PETSc.IntType).max
         for (r, c), block in scene.blocks.items():
             if block.data.size > limit:
-                raise SceneError(f"block ({r}, {c}): {block.data.size} entries on a rank; use more ranks, or a PETSc with 64-bit indices")
+                raise SceneError(
+                    f"block ({r}, {c}): {block.data.size} entries on a rank; "
+                    "use more ranks, or a PETSc with 64-bit indices"
+                )
 
     def _create_block(self, r: str, c: str, block: CSR | None) -> PETSc.Mat:
         sizes = (self.layout.sizes(r), self.layout.sizes(c))

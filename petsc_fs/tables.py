@@ -13,6 +13,7 @@ from petsc_fs.fields import FIELD
 from petsc_fs.scene import Scene, contact_state_counts
 
 WIDTH = 100
+PHASES = (("read", "read_seconds"), ("set-up", "setup_seconds"), ("solve", "solve_seconds"))
 
 
 def solve_table(scene: Scene, report: dict[str, Any]) -> str:
@@ -34,7 +35,7 @@ def solve_table(scene: Scene, report: dict[str, Any]) -> str:
         f"{verdict}: true residual {report['true_relative_residual']:.2e}, tolerance {report['tolerance']:.2e}",
         f"{report['iterations']} iterations ({report['reason']}) by {report['options_file']}"
         f" on {report['ranks']} rank{'s' if report['ranks'] > 1 else ''}",
-        f"set-up {report['setup_seconds']:.3f} s, solve {report['solve_seconds']:.3f} s, read {report['read_seconds']:.3f} s",
+        ", ".join(f"{what} {report[key]:.3f} s" for what, key in PHASES),
     ]
     return "\n".join([_title(scene, report["scene"]), _text(table) + "\n".join(lines)])
 

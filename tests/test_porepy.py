@@ -353,9 +353,7 @@ def test_temperature_is_not_supported(pp, tmp_path, monkeypatch):
     with pytest.raises(SceneError, match="prepare_simulation"):
         Adapter(model)
     model.prepare_simulation()
-    with pytest.raises(
-        LayoutError, match=r"unknowns temperature and equations energy_balance.*not supported"
-    ):
+    with pytest.raises(LayoutError, match=r"unknowns temperature and equations energy_balance.*not supported"):
         Adapter(model)
 
 
@@ -435,9 +433,7 @@ def test_export_writes_the_steps(pp, tmp_path):
     from petsc_fs.hdf5 import read
 
     lines = []
-    paths = export(
-        "model1", 1, tmp_path / "new", steps="1:0,1:2,mixed", reference=True, progress=lines.append
-    )
+    paths = export("model1", 1, tmp_path / "new", steps="1:0,1:2,mixed", reference=True, progress=lines.append)
     assert [p.name for p in paths[:2]] == ["model1_g1_t1_n0.h5", "model1_g1_t1_n2.h5"]
     assert len(paths) == 3
     assert sorted(p.name for p in (tmp_path / "new").iterdir()) == sorted(p.name for p in paths)
@@ -531,10 +527,7 @@ def test_a_missing_porepy_is_named(tmp_path):
 
 
 def test_import_is_lazy():
-    program = (
-        "import petsc_fs.porepy.export, sys\n"
-        "sys.exit('porepy' in sys.modules or 'petsc4py.PETSc' in sys.modules)"
-    )
+    program = "import petsc_fs.porepy.export, sys\nsys.exit('porepy' in sys.modules or 'petsc4py.PETSc' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         importlib.import_module("petsc_fs.porepy").nothing  # noqa: B018

@@ -100,8 +100,9 @@ class ContactTransform(WrapperPC):
                 for j, c in enumerate(columns):
                     if grid[i][j] is None:
                         sizes = (problem.layout.sizes(r), problem.layout.sizes(c))
-                        grid[i][j] = PETSc.Mat().createAIJ(sizes, nnz=0, comm=comm)
-                        grid[i][j].assemble()
+                        empty = PETSc.Mat().createAIJ(sizes, nnz=0, comm=comm)
+                        empty.assemble()
+                        grid[i][j] = empty
             nest = PETSc.Mat().createNest(grid, comm=comm)
             if rows != columns:
                 return nest

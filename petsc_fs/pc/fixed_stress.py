@@ -10,6 +10,7 @@ from petsc_fs.dm import Members, Problem, field_dm
 from petsc_fs.errors import UsageError
 from petsc_fs.fields import MECHANICS
 from petsc_fs.pc.wrapper import WrapperPC, choice
+from petsc_fs.scene import Integers, gather_rows
 
 PUBLISHED_DAMPING = 0.6
 
@@ -40,18 +41,19 @@ class FixedStress(WrapperPC):
         if "mass" not in names:
             raise UsageError(f"FixedStress needs a field 'mass'; it was given {', '.join(names)}")
         prefix = pc.getOptionsPrefix() or ""
-        known = problem.fixed_stress is not None
-        self.kind = choice(pc, "fs_type", ("analytic", "algebraic") if known else ("algebraic", "analytic"))
-        if self.kind == "analytic" and problem.fixed_stress is None:
+        coefficients = problem.fixed_stress
+        kinds = ("algebraic", "analytic") if coefficients is None else ("analytic", "algebraic")
+        self.kind = choice(pc, "fs_type", kinds)
+        if self.kind == "algebraic":
+            diagonal = algebraic_diagonal(problem)
+        elif coefficients is not None:
+            self.damping = PETSc.Options(prefix).getReal("fs_damping", PUBLISHED_DAMPING)
+            diagonal = coefficients[:, 0] * coefficients[:, 1] ** self.damping
+        else:
             raise UsageError(
                 f"-{prefix}fs_type analytic: the scene lacks material data, cell volumes or cell dimensions; "
                 f"use -{prefix}fs_type algebraic"
             )
-        if self.kind == "analytic":
-            self.damping = PETSc.Options(prefix).getReal("fs_damping", PUBLISHED_DAMPING)
-            diagonal = problem.fixed_stress[:, 0] * problem.fixed_stress[:, 1] ** self.damping
-        else:
-            diagonal = algebraic_diagonal(problem)
         if operator.getType() == "nest":
             k = names.index("mass")
             rows = range(len(names))
@@ -106,36 +108,37 @@ def algebraic_diagonal(problem: Problem) -> NDArray[np.float64]:
     place = np.full(sum(v.size for v in needed.values()), -1)
     result = np.zeros(local_mass.size)
     for k in range(local_mass.size):
-        dofs, j = _row(rows, k)
+        dofs, _, j = _rows(rows, np.array([k]))
         if not dofs.size:
             continue
         place[dofs] = np.arange(dofs.size)
-        A_loc = np.zeros((dofs.size, dofs.size))
-        for i, dof in enumerate(dofs):
-            others, values = _row(A, dof)
-            at = place[others]
-            A_loc[i, at[at >= 0]] = values[at >= 0]
-        right = np.zeros(dofs.size)
-        others, values = _row(columns_by_cell, k)
-        at = place[others]
-        right[at[at >= 0]] = values[at >= 0]
+        A_loc, right = np.zeros((dofs.size, dofs.size)), np.zeros(dofs.size)
+        others, at, values = _rows(A, dofs)
+        inside = place[others] >= 0
+        A_loc[at[inside], place[others[inside]]] = values[inside]
+        others, _, values = _rows(columns_by_cell, np.array([k]))
+        inside = place[others] >= 0
+        right[place[others[inside]]] = values[inside]
         place[dofs] = -1
-        result[k] = -j @ np.linalg.lstsq(A_loc, right, rcond=None)[0]
+        try:
+            result[k] = -j @ np.linalg.solve(A_loc, right)
+        except np.linalg.LinAlgError:
+            result[k] = -j @ np.linalg.lstsq(A_loc, right, rcond=None)[0]
     return np.maximum(result, 0.0)
 
 
-Triplet = tuple[NDArray[np.integer], NDArray[np.integer], NDArray[np.float64]]
+Triplet = tuple[Integers, Integers, NDArray[np.float64]]
 
 
 def _local_csr(
     problem: Problem,
     rows: list[str],
     columns: list[str],
-    row_ids: dict[str, NDArray[np.integer]],
-    column_ids: dict[str, NDArray[np.integer]],
+    row_ids: dict[str, Integers],
+    column_ids: dict[str, Integers],
 ) -> Triplet:
     """Rows and columns with given global numbers, fetched to this rank, as one CSR in that order."""
-    pieces: list[tuple[NDArray[np.integer], NDArray[np.integer], NDArray[np.float64]]] = []
+    pieces: list[tuple[Integers, Integers, NDArray[np.float64]]] = []
     row_start = 0
     for r in rows:
         column_start = 0
@@ -159,12 +162,14 @@ def _local_csr(
     return np.concatenate([[0], np.cumsum(np.bincount(i, minlength=row_start))]), j[order], v[order]
 
 
-def _transpose(indptr: NDArray[np.integer], indices: NDArray[np.integer], values: NDArray[np.float64], *, n: int) -> Triplet:
+def _transpose(indptr: Integers, indices: Integers, values: NDArray[np.float64], *, n: int) -> Triplet:
     order = np.argsort(indices, kind="stable")
     row_of = np.repeat(np.arange(indptr.size - 1), np.diff(indptr))
     return np.concatenate([[0], np.cumsum(np.bincount(indices, minlength=n))]), row_of[order], values[order]
 
 
-def _row(csr: Triplet, k: int) -> tuple[NDArray[np.integer], NDArray[np.float64]]:
-    part = slice(csr[0][k], csr[0][k + 1])
-    return csr[1][part], csr[2][part]
+def _rows(csr: Triplet, rows: Integers) -> Triplet:
+    """Entries of some rows: their columns, the place of their row among `rows`, their values."""
+    indptr, indices, values = csr
+    take, counts = gather_rows(indptr, rows)
+    return indices[take], np.repeat(np.arange(rows.size), counts), values[take]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Any
 
 from petsc4py import PETSc
 
@@ -19,7 +20,7 @@ class WrapperPC(ABC):
     """
 
     prefix: str
-    inner: PETSc.PC | None = None
+    inner: Any = None
 
     @abstractmethod
     def build(self, pc: PETSc.PC, problem: Problem, members: Members) -> tuple[PETSc.Mat, PETSc.DM]:

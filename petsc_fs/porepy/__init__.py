@@ -1,7 +1,7 @@
 """PorePy models, and scenes from them: the only part of the package that imports porepy.
 
 Importing this package does not import porepy; using a name of `models` or `adapter` does, and says
-how to install PorePy where it is missing. `export` and `cases` can be read without PorePy.
+how to install PorePy where it is missing. `export`, `cases` and `solver` can be read without PorePy.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ from petsc_fs.errors import UsageError
 _HOME = {
     "Adapter": "adapter",
     "scene_from_model": "adapter",
+    "FieldSplitSolver": "solver",
+    "LinearSolve": "solver",
     "MODELS": "models",
     "make_model": "models",
     "run": "models",
@@ -32,8 +34,7 @@ def require_porepy() -> Any:
         return import_module("porepy")
     except ImportError as e:
         raise UsageError(
-            f"PorePy is not installed ({e}); "
-            'pip install "porepy @ git+https://github.com/pmgbergen/porepy@v1.11"'
+            f'PorePy is not installed ({e}); pip install "porepy @ git+https://github.com/pmgbergen/porepy@v1.11"'
         ) from e
 
 

@@ -192,9 +192,7 @@ class Adapter:
         variables = sorted({name for name, _, size in structure[0] if size and name not in known})
         equations = sorted({name for name, _, size in structure[1] if size and name not in EQUATIONS})
         found = [
-            f"{what} {', '.join(names)}"
-            for what, names in (("unknowns", variables), ("equations", equations))
-            if names
+            f"{what} {', '.join(names)}" for what, names in (("unknowns", variables), ("equations", equations)) if names
         ]
         if found:
             raise LayoutError(
@@ -216,8 +214,7 @@ class Adapter:
             bs = self._block_size(name)
             if dofs.size != grid.num_cells * bs:
                 raise LayoutError(
-                    f"{name}: {dofs.size} unknowns on a grid of {grid.num_cells} cells, "
-                    f"expected {bs} per cell"
+                    f"{name}: {dofs.size} unknowns on a grid of {grid.num_cells} cells, expected {bs} per cell"
                 )
             per_cell = dofs.reshape(grid.num_cells, bs)
             if name == "contact":
@@ -322,9 +319,7 @@ def contact_state(model: Any, fractures: list[Any]) -> NDArray[np.int8]:
     c = evaluate(model, model.contact_mechanics_numerical_constant(fractures))
     bound = evaluate(model, model.friction_bound(fractures))
     per_cell = (t_n.size, model.nd - 1)
-    trial = np.linalg.norm(
-        traction.reshape(per_cell) + np.reshape(c, (-1, 1)) * slip.reshape(per_cell), axis=1
-    )
+    trial = np.linalg.norm(traction.reshape(per_cell) + np.reshape(c, (-1, 1)) * slip.reshape(per_cell), axis=1)
     is_open = -t_n < c * (_normal_jump(model, fractures) - gap)
     state = np.where(trial > np.maximum(bound, 0), SLIDING, STICKING)
     return np.where(is_open, OPEN, state).astype(np.int8)
@@ -356,9 +351,7 @@ def _per_cell(model: Any, operator: Any, subdomains: list[Any]) -> float | Float
     values = [np.asarray(evaluate(model, operator([sd])), dtype=np.float64) for sd in subdomains]
     if all(v.ndim == 0 for v in values) and len({float(v) for v in values}) == 1:
         return float(values[0])
-    return np.concatenate(
-        [np.broadcast_to(v, sd.num_cells) for v, sd in zip(values, subdomains, strict=True)]
-    )
+    return np.concatenate([np.broadcast_to(v, sd.num_cells) for v, sd in zip(values, subdomains, strict=True)])
 
 
 def _dimensions(grids: list[Any]) -> NDArray[np.int64]:

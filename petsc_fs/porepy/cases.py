@@ -185,9 +185,7 @@ class ModelParameters:
         """The parameters that are not at their default, such as "refinement=2, friction=0.1"."""
         default = ModelParameters()
         names = [n for n in self.__dataclass_fields__ if getattr(self, n) != getattr(default, n)]
-        return ", ".join(
-            f"{n}={v:g}" if isinstance(v := getattr(self, n), float | int) else f"{n}={v}" for n in names
-        )
+        return ", ".join(f"{n}={v:g}" if isinstance(v := getattr(self, n), float | int) else f"{n}={v}" for n in names)
 
 
 def find_case(name: str) -> Case:

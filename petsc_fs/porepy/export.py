@@ -233,7 +233,9 @@ def export_bundled(
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `run`; needs no PorePy."""
     parser.add_argument("model", choices=list(CASES), help="name of the model")
-    parser.add_argument("--refine", dest="refinement", type=float, default=1.0, metavar="G", help="cells are 100 m / G wide")
+    parser.add_argument(
+        "--refine", dest="refinement", type=float, default=1.0, metavar="G", help="cells are 100 m / G wide"
+    )
     parser.add_argument("--out", dest="directory", default=".", metavar="DIR", help="where the scenes go")
     parser.add_argument(
         "--steps",
@@ -257,9 +259,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="pressure in the east over the reference pressure, if not the model's own",
     )
     parser.add_argument("--physics", choices=PHYSICS, default="full", help="restricted: linear fluid mass")
-    parser.add_argument(
-        "--fracture-permeability", choices=FRACTURE_PERMEABILITY, help="if not the model's own"
-    )
+    parser.add_argument("--fracture-permeability", choices=FRACTURE_PERMEABILITY, help="if not the model's own")
     parser.add_argument("--reference", action="store_true", help="store an accurate solution too")
 
 

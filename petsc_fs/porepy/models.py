@@ -255,7 +255,6 @@ class RestrictedMass(pp.constitutive_laws.SpecificStorage):
 
 
 class PoromechanicsModel(
-    Hooks,
     NoFiles,
     CaseGeometry,
     MechanicsLoads,
@@ -269,7 +268,6 @@ class PoromechanicsModel(
 
 
 class MechanicsModel(
-    Hooks,
     NoFiles,
     CaseGeometry,
     MechanicsLoads,
@@ -279,7 +277,7 @@ class MechanicsModel(
     """Momentum and frictional contact, without fluid."""
 
 
-class FlowModel(Hooks, NoFiles, CaseGeometry, FlowLoads, CasePermeability, pp.SinglePhaseFlow):
+class FlowModel(NoFiles, CaseGeometry, FlowLoads, CasePermeability, pp.SinglePhaseFlow):
     """Fluid mass in rock and fractures that do not move."""
 
 
@@ -290,12 +288,15 @@ CLASSES: dict[str, type] = {
 }
 
 
-def make_model(name: str, parameters: ModelParameters | None = None, **changes: Any) -> Any:
+def make_model(
+    name: str, parameters: ModelParameters | None = None, *, mixins: tuple[type, ...] = (), **changes: Any
+) -> Any:
     """A model that is ready for `prepare_simulation`.
 
     Args:
         name: one of `MODELS`.
         parameters: what to vary; instead of them, keyword arguments of `ModelParameters`.
+        mixins: classes to put before the model's own, such as `FieldSplitSolver`.
         changes: see `parameters`.
 
     Raises:
@@ -312,7 +313,8 @@ def make_model(name: str, parameters: ModelParameters | None = None, **changes: 
         parameters = ModelParameters(**changes)
     elif changes:
         raise UsageError("make_model: give either `parameters` or keyword arguments")
-    cls = CLASSES[case.equations]
+    own = CLASSES[case.equations]
+    cls = type(own.__name__, (Hooks, *mixins, own), {})
     changed = parameters.changes()
     end = case.time_step * case.time_steps
     model = cls(
@@ -320,9 +322,7 @@ def make_model(name: str, parameters: ModelParameters | None = None, **changes: 
             "material_constants": _materials(parameters),
             "grid_type": "simplex",
             "meshing_arguments": {"cell_size": CELL / parameters.refinement},
-            "time_manager": pp.TimeManager(
-                schedule=[0, end], dt_init=case.time_step, constant_dt=True, iter_max=25
-            ),
+            "time_manager": pp.TimeManager(schedule=[0, end], dt_init=case.time_step, constant_dt=True, iter_max=25),
             "units": pp.Units(kg=MASS_UNIT),
             "linear_solver": "pypardiso" if find_spec("pypardiso") else "scipy_sparse",
             "adaptive_indicator_scaling": 1,

@@ -1,0 +1,69 @@
+"""Every shipped options file on every bundled scene that it claims."""
+
+from pathlib import Path
+
+import pytest
+from mpi4py import MPI
+from test_solver import database  # noqa: F401
+
+import petsc_fs
+from petsc_fs import hdf5, options
+from petsc_fs.solver import Solver
+
+pytestmark = pytest.mark.mpi
+SCENES = sorted((Path(petsc_fs.__path__[0]) / "scenes").glob("*.h5"))
+PAIRS = [
+    (file.path.name, scene.name)
+    for file in options.shipped()
+    for scene in SCENES
+    if file.fits(hdf5.read_sizes(scene)[1]) and scene.stem not in file.not_for
+]
+
+
+def test_every_file_and_every_scene_takes_part():
+    assert {file for file, _ in PAIRS} == {f.path.name for f in options.shipped()}
+    assert {scene for _, scene in PAIRS} == {s.name for s in SCENES}
+
+
+@pytest.mark.parametrize(("file", "scene"), PAIRS, ids=lambda v: Path(v).stem)
+def test_solves_to_its_tolerance_and_uses_every_option(database, file, scene):  # noqa: F811
+    before = set(options.unused())
+    database(file)
+    result = Solver(hdf5.read(Path(petsc_fs.__path__[0]) / "scenes" / scene)).solve()
+    assert result.converged, result
+    assert set(options.unused()) == before
+    assert max(result.error_by_field.values()) < 1e-2
+
+
+@pytest.mark.parametrize("file", options.shipped(), ids=lambda f: f.path.stem)
+def test_header_states_purpose_source_and_fields(file):
+    text = file.path.read_text()
+    assert len(file.purpose) > 20
+    assert "# source: " in text
+    assert "# fields: " in text
+
+
+@pytest.mark.parametrize("file", options.shipped(), ids=lambda f: f.path.stem)
+def test_every_level_names_its_ksp(file):
+    """A pc_type below the outermost one stands beside a ksp_type with the same prefix."""
+    prefixes, pcs, ksps = [""], [], []
+    for line in (raw.split("#")[0].split() for raw in file.path.read_text().splitlines()):
+        if line[:1] == ["-prefix_push"]:
+            prefixes.append(prefixes[-1] + line[1])
+        elif line[:1] == ["-prefix_pop"]:
+            prefixes.pop()
+        elif line:
+            name = prefixes[-1] + line[0][1:]
+            pcs += [name.removesuffix("pc_type")] if name.endswith("pc_type") else []
+            ksps += [name.removesuffix("ksp_type")] if name.endswith("ksp_type") else []
+    inner_of_python_pc = {p for p in pcs if p.endswith(("qr_", "fs_"))}
+    assert set(pcs) - inner_of_python_pc == set(ksps)
+
+
+def test_iterations_do_not_depend_on_the_transformation(database):  # noqa: F811
+    """Right and left transformation are equally good, as the paper says."""
+    counts = {}
+    for file in ("contact_poromechanics.opts", "contact_poromechanics_left.opts"):
+        database(file)
+        counts[file] = Solver(hdf5.read(SCENES[-2])).solve().iterations
+    assert max(counts.values()) - min(counts.values()) <= 2 + MPI.COMM_WORLD.size
