@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import json
 import os
 import sys
@@ -10,7 +12,7 @@ import time
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from petsc_fs.errors import PetscFsError, SceneError, UsageError, together
 from petsc_fs.fields import in_order
@@ -49,18 +51,18 @@ solve failed; 2 wrong call or option; 3 a scene that cannot be read or does not 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code. Collective on all ranks of an MPI run."""
-    own, petsc = split_arguments(sys.argv[1:] if argv is None else argv)
-    try:
-        args = _parser().parse_args(own)
-    except SystemExit as e:
-        return int(e.code or 0)
     from mpi4py import MPI
 
     comm = MPI.COMM_WORLD
+    own, petsc = split_arguments(sys.argv[1:] if argv is None else argv)
     try:
+        with contextlib.redirect_stdout(io.StringIO() if comm.rank else sys.stdout):
+            args = _parser().parse_args(own)
         if petsc and args.command != "solve":
             raise UsageError(f"{petsc[0]}: PETSc options go with 'solve'; options of this program have two dashes")
         return int(args.run(args, petsc, comm))
+    except SystemExit as e:  # --help
+        return int(e.code or 0)
     except PetscFsError as e:
         return _fail(comm, f"petsc-fs: {e}", e.exit_code)
     except KeyboardInterrupt:
@@ -108,9 +110,16 @@ def _fail(comm: MPI.Intracomm, message: str, code: int) -> int:
     return code
 
 
+class _Parser(argparse.ArgumentParser):
+    """One line on a wrong call, as for any other error."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(f"{message}; see {self.prog} --help")
+
+
 def _parser() -> argparse.ArgumentParser:
     raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(prog="petsc-fs", description=DESCRIPTION, formatter_class=raw)
+    parser = _Parser(prog="petsc-fs", description=DESCRIPTION, formatter_class=raw)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def add(name: str, summary: str, run: Any, **more: Any) -> argparse.ArgumentParser:
@@ -130,6 +139,9 @@ def _parser() -> argparse.ArgumentParser:
     convert = add("convert", "turn a scene into PETSc's binary format, or back", _convert, epilog=CONVERT_EPILOG)
     convert.add_argument("source", metavar="SOURCE", help="scene (.h5), or folder in PETSc's format")
     convert.add_argument("target", metavar="TARGET", help="folder to write, or scene (.h5)")
+    convert.add_argument(
+        "--dimension", type=int, choices=(2, 3), help="of the rock, where SOURCE is a folder without scene.h5"
+    )
 
     export = add("export", "run a PorePy model and write its linear systems as scenes", _export)
     from petsc_fs.porepy.export import add_arguments
@@ -141,7 +153,8 @@ def _parser() -> argparse.ArgumentParser:
 CONVERT_EPILOG = """\
 The folder holds matrix.petsc (MatLoad), rhs.petsc and, if known, reference.petsc (VecLoad), one
 fields/NAME.petsc per field (ISLoad: the rows and columns of the field), and scene.h5 with what PETSc's
-format has no place for (cell data, material, units), without which the way back gives less."""
+format has no place for (cell data, material, units), without which the way back gives less and needs
+--dimension."""
 
 
 def _solve(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
@@ -171,10 +184,10 @@ def _solve(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> i
     read_seconds = time.perf_counter() - started
     solver = Solver(scene, comm, layout=layout)
     result = solver.solve()
-    _refuse_unused(solver, given, comm)
+    _refuse_unused(given, comm)
 
     everything = solver.system.gather(result.solution)
-    if comm.rank == 0:
+    with together(comm):
         report = _report(
             scene,
             solver,
@@ -184,10 +197,11 @@ def _solve(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> i
             read_seconds=read_seconds,
             database=PETSc.Options().getAll(),
         )
-        if args.report is not None:
+        if everything is not None and args.report is not None:
             _write_text(args.report, json.dumps(report, indent=2) + "\n")
-        if args.save is not None and everything is not None:
+        if everything is not None and args.save is not None:
             hdf5.write_solution(everything, args.save, scene)
+    if comm.rank == 0:
         from petsc_fs.tables import solve_table
 
         print(solve_table(scene, report), flush=True)
@@ -220,18 +234,17 @@ def _with_options_file(petsc: list[str], fields: tuple[str, ...]) -> tuple[list[
     return petsc, files[0]
 
 
-def _refuse_unused(solver: Solver, given: list[str], comm: MPI.Intracomm) -> None:
+def _refuse_unused(given: list[str], comm: MPI.Intracomm) -> None:
     """Raise a UsageError on all ranks if an option that the user gave did nothing."""
     from petsc_fs import options
 
     useless = comm.bcast([name for name in options.unused() if name in given])
     if not useless:
         return
-    valid = options.queried(solver.queried_options) | {"petsc_fs_mat_type", "petsc_fs_true_rtol"}
-    valid = comm.bcast(valid)
+    valid = {"petsc_fs_mat_type", "petsc_fs_true_rtol", *options.known_names()} - set(useless)
     lines = []
     for name in useless:
-        similar = options.closest(name, valid - {name})
+        similar = options.closest(name, valid)
         hint = f"; did you mean {' or '.join('-' + s for s in similar)}?" if similar else ""
         lines.append(f"option -{name} was not used{hint}")
     raise UsageError("; ".join(lines) if len(lines) < 2 else "\n  ".join([f"{len(lines)} options:", *lines]))
@@ -291,14 +304,17 @@ def _inspect(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) ->
     from petsc_fs import hdf5
     from petsc_fs.tables import inspect_table
 
+    lines = []
     with together(comm):
         if comm.rank == 0:
             scene = hdf5.read(find_scene(args.scene))
-            print(inspect_table(scene), flush=True)
+            lines.append(inspect_table(scene))
             if args.plot is not None:
                 from petsc_fs.plot import plot_blocks
 
-                print(f"block structure drawn in {plot_blocks(scene, args.plot)}")
+                lines.append(f"block structure drawn in {plot_blocks(scene, args.plot)}")
+    if comm.rank == 0:
+        print("\n".join(lines), flush=True)
     return 0
 
 
@@ -312,7 +328,7 @@ def _convert(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) ->
 
     source, target = Path(args.source), Path(args.target)
     if source.is_dir():
-        written = petsc_binary.to_scene(source, target)
+        written = petsc_binary.to_scene(source, target, dimension=args.dimension)
     else:
         written = petsc_binary.from_scene(find_scene(args.source), target)
     print(f"written: {', '.join(str(p) for p in written)}")

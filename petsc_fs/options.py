@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import ctypes
 import difflib
+import itertools
 import os
 import re
 import sys
 import sysconfig
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,6 +39,9 @@ def find_options_file(name: str) -> Path:
     if not os.access(path, os.R_OK):
         raise UsageError(f"options file {name}: no permission to read it")
     return path
+
+
+_numbers = itertools.count()
 
 
 @dataclass(frozen=True)
@@ -164,30 +168,54 @@ def unused() -> list[str]:
     return sorted(found)
 
 
-def queried(set_up: Callable[[], None]) -> set[str]:
-    """Names of the options that a set-up asks for, as PETSc's own help lists them.
+def known_names() -> set[str]:
+    """Names of all options of the KSPs and PCs that the database chooses a type for. Local.
 
-    Collective if `set_up` is. What is printed meanwhile is swallowed.
+    They are as PETSc's own help lists them, which is caught on its way to standard output. Each KSP is
+    made for this purpose, under a short prefix: PETSc explains the options of a prefix only once, even
+    where nobody listened, and PETSc 3.18 overruns a buffer where a prefix has more than 64 characters.
     """
     from petsc4py import PETSc
 
+    chosen = PETSc.Options().getAll()
+    types = {name: value for name, value in chosen.items() if name.endswith("_type") and value != "python"}
+    found = set(chosen)
+    for prefix in {m[1] for name in chosen if (m := re.fullmatch("(|.*_)(ksp|pc)_type", name))}:
+        below = {name.removeprefix(prefix): value for name, value in types.items() if name.startswith(prefix)}
+        found.update(prefix + name for name in _explain(below))
+    return found
+
+
+def _explain(types: Mapping[str, str]) -> set[str]:
+    """Options of a KSP and its PC of the given types, by PETSc's help."""
+    from petsc4py import PETSc
+
+    prefix = f"h{next(_numbers)}_"
     database = PETSc.Options()
     sys.stdout.flush()
     saved = os.dup(1)
+    ksp = PETSc.KSP().create(PETSc.COMM_SELF)
+    ksp.setOptionsPrefix(prefix)
+    for name, value in types.items():
+        database.setValue(prefix + name, value)
     with tempfile.TemporaryFile() as capture:
         os.dup2(capture.fileno(), 1)
         database.setValue("help", None)
         try:
-            set_up()
+            ksp.setFromOptions()
+        except PETSc.Error:
+            pass  # an impossible type: what is understood until there will do
         finally:
             database.delValue("help")
-            PETSc.Sys.syncFlush()
+            for name in types:
+                database.delValue(prefix + name)
             ctypes.CDLL(None).fflush(None)
             os.dup2(saved, 1)
             os.close(saved)
+            ksp.destroy()
         capture.seek(0)
         text = capture.read().decode(errors="replace")
-    return set(re.findall(r"^\s*-([A-Za-z_]\w*)", text, flags=re.MULTILINE))
+    return set(re.findall(rf"^\s*-{prefix}([A-Za-z_]\w*)", text, flags=re.MULTILINE))
 
 
 def closest(name: str, valid: Iterable[str]) -> list[str]:

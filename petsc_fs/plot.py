@@ -25,10 +25,11 @@ def _pyplot() -> Any:
 
 
 def plot_blocks(scene: Scene, path: str | os.PathLike[str]) -> Path:
-    """Draw which blocks of the Jacobian are empty, invertible or singular, as in the paper's figure.
+    """Draw the block structure of the Jacobian, and above it what each level eliminates, as the paper does.
 
-    Each cell of the grid is one block, shaded where it has entries; within it, the pattern of the
-    entries. `S` marks a diagonal block that is singular (contact where a fracture sticks).
+    Above, one small grid per stage: white blocks are empty, light ones those of the Jacobian, dark ones
+    changed by the transformation or by a Schur complement, `S` a singular diagonal block. Below, the
+    entries of the Jacobian itself.
 
     Args:
         scene: with all rows.
@@ -40,45 +41,87 @@ def plot_blocks(scene: Scene, path: str | os.PathLike[str]) -> Path:
     plt = _pyplot()
     names = scene.fields
     n = len(names)
-    figure, axes = plt.subplots(figsize=(1.5 * n + 1.8, 1.5 * n + 1.0), layout="constrained")
-    for i, r in enumerate(names):
-        for j, c in enumerate(names):
-            block = scene.blocks.get((r, c))
-            filled = block is not None and block.data.size > 0
-            axes.add_patch(
-                plt.Rectangle((j, i), 1, 1, facecolor="#dfe5ec" if filled else "white", edgecolor="#444444", lw=0.8)
-            )
-            if block is None or not filled:
-                continue
-            rows = np.repeat(np.arange(scene.sizes[r]), np.diff(block.indptr))
-            x = j + 0.04 + 0.92 * (block.indices + 0.5) / scene.sizes[c]
-            y = i + 0.04 + 0.92 * (rows + 0.5) / scene.sizes[r]
-            axes.plot(x, y, ",", color="#1f4e79", rasterized=True)
-            index = f"{FIELD[r].index}{FIELD[c].index}"
-            label = f"$J_{{{index}}}$" + (
-                " S" if r == c == "contact" and singular_blocks(block, scene.dimension) else ""
-            )
-            box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.85}
-            axes.text(j + 0.5, i + 0.5, label, ha="center", va="center", fontsize=11, bbox=box)
-    axes.set_xlim(0, n)
-    axes.set_ylim(n, 0)
-    axes.set_aspect("equal")
+    steps = stages(scene)
+    figure = plt.figure(figsize=(max(1.5 * n + 1.8, 2.0 * len(steps)), 1.5 * n + 3.4), layout="constrained")
+    grid = figure.add_gridspec(2, len(steps), height_ratios=(1, 4))
+    for k, (title, shades) in enumerate(steps):
+        small = figure.add_subplot(grid[0, k])
+        for (r, c), shade in shades.items():
+            i, j = names.index(r), names.index(c)
+            small.add_patch(plt.Rectangle((j, i), 1, 1, facecolor=SHADES[shade], edgecolor="#444444", lw=0.6))
+            if shade == "singular":
+                small.text(j + 0.5, i + 0.5, "S", ha="center", va="center", fontsize=8)
+        _frame(small, n)
+        small.set_xticks([])
+        small.set_yticks([])
+        small.set_title(title, fontsize=9)
+    axes = figure.add_subplot(grid[1, :])
+    for (r, c), block in scene.blocks.items():
+        if not block.data.size:
+            continue
+        i, j = names.index(r), names.index(c)
+        axes.add_patch(plt.Rectangle((j, i), 1, 1, facecolor=SHADES["original"], edgecolor="#444444", lw=0.8))
+        rows = np.repeat(np.arange(scene.sizes[r]), np.diff(block.indptr))
+        x = j + 0.04 + 0.92 * (block.indices + 0.5) / scene.sizes[c]
+        y = i + 0.04 + 0.92 * (rows + 0.5) / scene.sizes[r]
+        axes.plot(x, y, ",", color="#1f4e79", rasterized=True)
+        box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.85}
+        label = f"$J_{{{FIELD[r].index}{FIELD[c].index}}}$"
+        axes.text(j + 0.5, i + 0.5, label, ha="center", va="center", fontsize=11, bbox=box)
+    _frame(axes, n)
     axes.set_xticks(np.arange(n) + 0.5, [f"{f}\n{scene.sizes[f]:,}" for f in names], fontsize=9)
     axes.set_yticks(np.arange(n) + 0.5, names, fontsize=9)
-    axes.tick_params(length=0, top=False)
+    axes.tick_params(length=0)
     axes.xaxis.tick_top()
     axes.set_xlabel("unknowns (columns)")
     axes.set_ylabel("equations (rows)")
-    title = scene.metadata.model or "scene"
-    axes.set_title(f"{title}: {sum(scene.sizes.values()):,} unknowns; S: singular diagonal block", fontsize=10)
+    figure.suptitle(f"{scene.metadata.model or 'scene'}: {sum(scene.sizes.values()):,} unknowns", fontsize=11)
     target = Path(path)
     try:
-        figure.savefig(target, dpi=150)
+        figure.savefig(target, dpi=120)
     except (OSError, ValueError) as e:
         raise UsageError(f"{target}: cannot be drawn: {e}") from e
     finally:
         plt.close(figure)
     return target
+
+
+SHADES = {"original": "#dfe5ec", "singular": "#dfe5ec", "changed": "#7f93a8"}
+
+
+def _frame(axes: Any, n: int) -> None:
+    """Axes of an n by n grid of blocks, first row on top."""
+    axes.set_xlim(0, n)
+    axes.set_ylim(n, 0)
+    axes.set_aspect("equal")
+    for k in range(1, n):
+        axes.axhline(k, color="#bbbbbb", lw=0.4, zorder=0)
+        axes.axvline(k, color="#bbbbbb", lw=0.4, zorder=0)
+
+
+def stages(scene: Scene) -> list[tuple[str, dict[tuple[str, str], str]]]:
+    """What is left after each level of the solver: title, and a shade for each block that is not empty."""
+    original = {rc: "original" for rc, b in scene.blocks.items() if b.data.size}
+    steps = []
+    shades = dict(original)
+    if "contact" in scene.sizes:
+        singular = singular_blocks(scene.blocks["contact", "contact"], scene.dimension)
+        shades["contact", "contact"] = "singular" if singular else "original"
+    steps.append(("$J$", shades))
+    if {"contact", "intf_force"} <= set(scene.sizes):
+        column = [r for r in scene.fields if (r, "intf_force") in original]
+        transformed = original | {(r, "contact"): "changed" for r in column}
+        steps.append(("$J Q_r$", transformed))
+        original = {(r, c): v for (r, c), v in original.items() if "contact" not in (r, c)}
+        original |= {(r, "intf_force"): "changed" for r in column if r != "contact"}
+        steps.append(("$S^1$", original))
+    if "mass" in scene.sizes and "momentum" in scene.sizes:
+        original = {rc: v for rc, v in original.items() if not {"momentum", "intf_force"} & set(rc)}
+        original |= {("mass", "mass"): "changed"}
+        steps.append(("$S^2$", original))
+    if "intf_flow" in scene.sizes:
+        steps.append(("$S^3$", {("mass", "mass"): "changed"}))
+    return steps
 
 
 def singular_blocks(block: CSR, size: int) -> int:

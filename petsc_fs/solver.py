@@ -8,6 +8,7 @@ import re
 import time
 import weakref
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -97,7 +98,7 @@ class Solver:
         mpi = comm or MPI.COMM_WORLD
         started = time.perf_counter()
         self.prefix = prefix
-        self.ksp: PETSc.KSP | None = None
+        self.ksp: Any = None
         self._number = next(_numbers)
         _live.add(self)
         self.layout = layout or Layout.contiguous(mpi, scene.dimension, scene.sizes)

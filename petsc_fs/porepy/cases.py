@@ -21,6 +21,13 @@ CELL = 100.0
 MASS_UNIT = 1e10
 """Models count mass in this many kg, so that stiffness and permeability come closer to each other."""
 
+CONTACT_SCALING = 0.1
+"""Numerical constant c of the contact conditions, times the characteristic displacement.
+
+It decides on which side of a maximum an iterate is, not what the solution is. 0.1 was the default
+of the PorePy of the published runs; PorePy 1.11 has 1.
+"""
+
 Physics = Literal["full", "restricted"]
 FracturePermeability = Literal["unit", "cubic", "constant"]
 PHYSICS = get_args(Physics)

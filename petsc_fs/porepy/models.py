@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from petsc_fs.errors import SolveError, UsageError
 from petsc_fs.porepy import require_porepy
-from petsc_fs.porepy.cases import CASES, CELL, MASS_UNIT, SIDE, Case, ModelParameters, find_case
+from petsc_fs.porepy.cases import CASES, CELL, CONTACT_SCALING, MASS_UNIT, SIDE, Case, ModelParameters, find_case
 
 require_porepy()
 
@@ -160,6 +160,16 @@ class MechanicsLoads(pp.SolutionStrategy):
         return values.ravel("F")
 
 
+class ContactConstant(pp.SolutionStrategy):
+    """The numerical constant c of the contact conditions is that of the published runs."""
+
+    def contact_mechanics_numerical_constant(self, subdomains: list[Any]) -> Any:
+        """C as an AD operator, per unit of displacement."""
+        constant = pp.ad.Scalar(CONTACT_SCALING) / self.characteristic_displacement(subdomains)
+        constant.set_name("contact_mechanics_numerical_constant")
+        return constant
+
+
 class FlowLoads(pp.SolutionStrategy):
     """Pressure is given on all sides, higher in the east; it starts at the reference pressure."""
 
@@ -258,6 +268,7 @@ class PoromechanicsModel(
     NoFiles,
     CaseGeometry,
     MechanicsLoads,
+    ContactConstant,
     FlowLoads,
     CasePermeability,
     RestrictedMass,
@@ -271,6 +282,7 @@ class MechanicsModel(
     NoFiles,
     CaseGeometry,
     MechanicsLoads,
+    ContactConstant,
     solution_strategy.ContactIndicators,
     pp.momentum_balance.MomentumBalance,
 ):
@@ -431,12 +443,10 @@ def _materials(parameters: ModelParameters) -> dict[str, Any]:
         "viscosity": rock.fluid_viscosity,
     }
     if CONSTANTS_ARE_METHODS:
-        # The contact numbers are what later releases of PorePy have by default.
-        contact = {"open_state_tolerance": 1e-10, "contact_mechanics_scaling": 1.0}
+        # The tolerance is what later releases of PorePy have by default.
+        contact = {"open_state_tolerance": 1e-10, "characteristic_displacement": rock.characteristic_displacement}
         return {
-            "solid": pp.SolidConstants(
-                solid | contact | {"characteristic_displacement": rock.characteristic_displacement}
-            ),
+            "solid": pp.SolidConstants(solid | contact),
             "fluid": pp.FluidConstants(fluid | {"pressure": rock.reference_pressure}),
         }
     return {

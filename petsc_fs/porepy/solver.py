@@ -172,7 +172,7 @@ class FieldSplitSolver:
         useless = {prefix + name for name in options.parse(file)} & set(options.unused())
         if not useless:
             return
-        valid = options.queried(solver.queried_options) - useless
+        valid = options.known_names() - useless
         lines = []
         for name in sorted(useless):
             similar = " or ".join(f"-{s}" for s in options.closest(name, valid))
