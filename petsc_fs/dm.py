@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from petsc_fs.fields import MECHANICS
 from petsc_fs.layout import Layout
 from petsc_fs.scene import Integers
 
@@ -94,6 +95,74 @@ def field_dm(problem: Problem, members: Members) -> PETSc.DMShell:
     return dm
 
 
+def merge_mechanics(names: Sequence[str]) -> Members:
+    """Fields with those of mechanics as one member, in order."""
+    merged: list[tuple[str, tuple[str, ...]]] = []
+    mechanics = tuple(n for n in names if n in MECHANICS)
+    for name in names:
+        if name not in MECHANICS:
+            merged.append((name, (name,)))
+        elif name == mechanics[0]:
+            merged.append(("mechanics", mechanics))
+    return merged
+
+
+def field_nest(members: Members, blocks: Blocks, layout: Layout) -> PETSc.Mat:
+    """One MatNest over fields, those made of several assembled into one AIJ on the diagonal.
+
+    Collective. Assembling copies; all other blocks are there by reference, in a MatNest of their own
+    where a row or column has several fields. The AIJ keeps the block size that its fields share, which
+    multigrid needs.
+
+    Args:
+        members: fields by name, as in `field_dm`.
+        blocks: matrices by pairs of fields of the table.
+        layout: distribution of rows.
+    """
+
+    def block(rows: tuple[str, ...], columns: tuple[str, ...]) -> PETSc.Mat | None:
+        if len(rows) == len(columns) == 1:
+            return blocks.get((rows[0], columns[0]))
+        if not any((r, c) in blocks for r in rows for c in columns):
+            return None
+        return one_matrix(rows, blocks, layout) if rows == columns else _nest(rows, columns, blocks, layout)
+
+    return PETSc.Mat().createNest([[block(r, c) for _, c in members] for _, r in members], comm=layout.comm)
+
+
+def one_matrix(fields: Sequence[str], blocks: Blocks, layout: Layout, out: PETSc.Mat | None = None) -> PETSc.Mat:
+    """The square matrix of some fields as one AIJ with the block size they share. Collective.
+
+    Args:
+        fields: of the rows and columns, in the order of the table.
+        blocks: matrices by pairs of fields, copied.
+        layout: distribution of rows.
+        out: an earlier result of the same pattern, to take the new values.
+    """
+    if len(fields) == 1:
+        return blocks[fields[0], fields[0]]
+    nest = _nest(fields, fields, blocks, layout)
+    matrix = nest.convert("aij", PETSc.Mat() if out is None else out)
+    nest.destroy()
+    if out is None:
+        size = common_block_size(layout, fields)
+        matrix.setBlockSizes(size, size)
+    return matrix
+
+
+def _nest(rows: Sequence[str], columns: Sequence[str], blocks: Blocks, layout: Layout) -> PETSc.Mat:
+    """A MatNest of blocks by reference, with empty matrices for those that are missing."""
+
+    def block(r: str, c: str) -> PETSc.Mat:
+        if (r, c) in blocks:
+            return blocks[r, c]
+        empty = PETSc.Mat().createAIJ((layout.sizes(r), layout.sizes(c)), nnz=0, comm=layout.comm)
+        empty.assemble()
+        return empty
+
+    return PETSc.Mat().createNest([[block(r, c) for c in columns] for r in rows], comm=layout.comm)
+
+
 def common_block_size(layout: Layout, fields: Sequence[str]) -> int:
     """Block size of a vector made of these fields: theirs if all agree, else 1."""
     sizes = {layout.block_size(f) for f in fields}
@@ -105,7 +174,7 @@ def near_null_space(problem: Problem, fields: Sequence[str]) -> PETSc.NullSpace 
 
     Collective. 3 modes in 2D, 6 in 3D, made orthonormal, as `MatSetNearNullSpace` wants them.
     """
-    if not all(f in ("intf_force", "momentum") and f in problem.cell_centers for f in fields):
+    if not all(f in MECHANICS and f in problem.cell_centers for f in fields):
         return None
     layout = problem.layout
     centers = np.concatenate([problem.cell_centers[f] for f in fields])

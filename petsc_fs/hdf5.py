@@ -29,7 +29,7 @@ import numpy as np
 
 from petsc_fs.errors import LayoutError, SceneError, UsageError
 from petsc_fs.fields import FIELD, FIELD_NAMES, in_order
-from petsc_fs.scene import CSR, Material, Metadata, Scene
+from petsc_fs.scene import CSR, Floats, Material, Metadata, Scene
 
 ENCODING = "petsc_fs scene"
 VERSION = 1
@@ -272,9 +272,7 @@ def _read(file: h5py.File, dimension: int, sizes: dict[str, int], rows: Mapping[
                 raise LayoutError(f"{name}: {what} has {len(group[what])} entries, expected {expected}")
             a, b = rows[name]
             values = group[what][a // bs : b // bs] if per_cell else group[what][a:b]
-            store[name] = (
-                values if what in ("cell_dimension", "contact_state") else np.asarray(values, dtype=np.float64)
-            )
+            store[name] = values if what in ("cell_dimension", "contact_state") else _real(values)
     blocks: dict[tuple[str, str], CSR] = {}
     for r, row in file["blocks"].items():
         for c in row:
@@ -325,7 +323,12 @@ def _read_block(group: h5py.Group, what: str, shape: tuple[int, int], start: int
         raise LayoutError(f"{what}: indptr runs to {b}, but there are {values.size} values")
     if stop == shape[0] and b != values.size:
         raise LayoutError(f"{what}: indptr ends at {b}, but there are {values.size} values")
-    return CSR(indptr - a, columns[a:b], np.asarray(values[a:b], dtype=np.float64))
+    return CSR(indptr - a, columns[a:b], _real(values[a:b]))
+
+
+def _real(values: Any) -> Floats:
+    """Numbers as they are computed with; a TypeError for text and complex numbers."""
+    return np.asarray(values).astype(np.float64, casting="same_kind", copy=False)
 
 
 def _read_material(file: h5py.File, size: int, rows: tuple[int, int]) -> Material:
@@ -334,5 +337,5 @@ def _read_material(file: h5py.File, size: int, rows: tuple[int, int]) -> Materia
     for name in group:
         if group[name].shape != (size,):
             raise LayoutError(f"material: {name} has shape {group[name].shape}, expected {(size,)}")
-    values = {n: group[n][slice(*rows)] if n in group else float(group.attrs[n]) for n in names}
+    values = {n: _real(group[n][slice(*rows)]) if n in group else float(group.attrs[n]) for n in names}
     return Material(**values, time_step=float(group.attrs["time_step"]))

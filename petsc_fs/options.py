@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import difflib
 import itertools
@@ -198,7 +199,8 @@ def _explain(types: Mapping[str, str]) -> set[str]:
     ksp.setOptionsPrefix(prefix)
     for name, value in types.items():
         database.setValue(prefix + name, value)
-    with tempfile.TemporaryFile() as capture:
+    # petsc4py prints by Python where that has another standard output than C
+    with tempfile.TemporaryFile("w+", errors="replace") as capture, contextlib.redirect_stdout(capture):
         os.dup2(capture.fileno(), 1)
         database.setValue("help", None)
         try:
@@ -213,8 +215,9 @@ def _explain(types: Mapping[str, str]) -> set[str]:
             os.dup2(saved, 1)
             os.close(saved)
             ksp.destroy()
+        capture.flush()
         capture.seek(0)
-        text = capture.read().decode(errors="replace")
+        text = capture.read()
     return set(re.findall(rf"^\s*-{prefix}([A-Za-z_]\w*)", text, flags=re.MULTILINE))
 
 

@@ -155,6 +155,12 @@ def _load(thing: PETSc.Object, path: Path) -> PETSc.Object:
         viewer.destroy()
     except PETSc.Error as e:
         raise SceneError(unreadable) from e
+    finally:
+        for kind in (
+            "mat",
+            "vec",
+        ):  # from NAME.info, which PETSc reads into the database and applies to all that follow
+            PETSc.Options().delValue(f"{kind}load_block_size")
     return thing
 
 

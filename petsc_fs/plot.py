@@ -10,7 +10,7 @@ import numpy as np
 
 from petsc_fs.errors import UsageError
 from petsc_fs.fields import FIELD
-from petsc_fs.scene import CSR, Scene
+from petsc_fs.scene import Scene, singular_diagonal_blocks
 
 
 def _pyplot() -> Any:
@@ -105,7 +105,7 @@ def stages(scene: Scene) -> list[tuple[str, dict[tuple[str, str], str]]]:
     steps = []
     shades = dict(original)
     if "contact" in scene.sizes:
-        singular = singular_blocks(scene.blocks["contact", "contact"], scene.dimension)
+        singular = singular_diagonal_blocks(scene.blocks["contact", "contact"], scene.dimension)
         shades["contact", "contact"] = "singular" if singular else "original"
     steps.append(("$J$", shades))
     if {"contact", "intf_force"} <= set(scene.sizes):
@@ -122,13 +122,3 @@ def stages(scene: Scene) -> list[tuple[str, dict[tuple[str, str], str]]]:
     if "intf_flow" in scene.sizes:
         steps.append(("$S^3$", {("mass", "mass"): "changed"}))
     return steps
-
-
-def singular_blocks(block: CSR, size: int) -> int:
-    """Number of singular diagonal blocks of this size in a square block."""
-    rows = np.repeat(np.arange(block.indptr.size - 1), np.diff(block.indptr))
-    inside = rows // size == block.indices // size
-    dense = np.zeros(((block.indptr.size - 1) // size, size, size))
-    dense[rows[inside] // size, rows[inside] % size, block.indices[inside] % size] = block.data[inside]
-    values = np.linalg.svd(dense, compute_uv=False)
-    return int(np.count_nonzero(~(values[:, -1] > 1e-14 * values[:, 0])))

@@ -15,6 +15,9 @@ from petsc_fs.fields import FIELD, FIELD_NAMES, in_order
 Floats = NDArray[np.float64]
 Integers = NDArray[np.integer[Any]]
 
+ALMOST_SINGULAR = 1e-14
+"""Ratio of least to greatest singular value at which a small matrix counts as singular."""
+
 CONTACT_STATES = ("sticking", "sliding", "open")
 """Names of the values 0, 1, 2 of `Scene.contact_state`."""
 
@@ -153,7 +156,10 @@ class Scene:
         Raises:
             LayoutError: a row or column belongs to no field or to two, or rows and columns of a
                 field differ in number, or matrix and right-hand side do.
+            SceneError: a number is complex or not finite.
         """
+        if np.iscomplexobj(matrix.data) or np.iscomplexobj(rhs):
+            raise SceneError("matrix or rhs is complex; a scene is real")
         b = np.asarray(rhs, dtype=np.float64)
         n = b.size
         if getattr(matrix, "format", "csr") != "csr":
@@ -321,7 +327,7 @@ class Scene:
             bs = self.block_size(name)
             return slice(rows[name][0] // bs, rows[name][1] // bs)
 
-        material = self.material
+        material = self.material if "mass" in self.sizes else None
         if material is not None:
             cut = {k: v if np.ndim(v) == 0 else np.asarray(v)[cells("mass")] for k, v in material.cell_data().items()}
             material = Material(**cut, time_step=material.time_step)
@@ -333,7 +339,9 @@ class Scene:
             reference={f: v[slice(*rows[f])] for f, v in self.reference.items()},
             cell_centers={f: v[cells(f)] for f, v in self.cell_centers.items()},
             cell_volumes={f: v[cells(f)] for f, v in self.cell_volumes.items()},
-            cell_dimension=None if self.cell_dimension is None else self.cell_dimension[cells("mass")],
+            cell_dimension=None
+            if self.cell_dimension is None or "mass" not in rows
+            else self.cell_dimension[cells("mass")],
             contact_state=None if self.contact_state is None else self.contact_state[cells("contact")],
             material=material,
             metadata=self.metadata,
@@ -347,6 +355,36 @@ def csr_rows(block: CSR, start: int, stop: int) -> CSR:
     """Rows start:stop of a block."""
     a, b = block.indptr[start], block.indptr[stop]
     return CSR(block.indptr[start : stop + 1] - a, block.indices[a:b], block.data[a:b])
+
+
+def diagonal_blocks(block: CSR, size: int, first_row: int = 0) -> Floats:
+    """The blocks on the diagonal of a square block, dense.
+
+    Args:
+        block: rows from `first_row` on, columns numbered globally.
+        size: of the diagonal blocks.
+        first_row: global number of the first row.
+
+    Returns:
+        (rows / size, size, size).
+    """
+    rows = np.repeat(np.arange(block.indptr.size - 1), np.diff(block.indptr))
+    columns = block.indices - first_row
+    inside = rows // size == columns // size
+    dense = np.zeros(((block.indptr.size - 1) // size, size, size))
+    dense[rows[inside] // size, rows[inside] % size, columns[inside] % size] = block.data[inside]
+    return dense
+
+
+def singular(dense: Floats) -> NDArray[np.bool_]:
+    """Which matrices of a stack (n, size, size) are singular to rounding, not finite ones included."""
+    values = np.linalg.svd(dense, compute_uv=False)
+    return np.asarray(~(values[:, -1] > ALMOST_SINGULAR * values[:, 0]))
+
+
+def singular_diagonal_blocks(block: CSR, size: int, first_row: int = 0) -> int:
+    """Number of singular diagonal blocks of a square block, see `diagonal_blocks`."""
+    return int(np.count_nonzero(singular(diagonal_blocks(block, size, first_row))))
 
 
 def _indices(spec: Any, n: int) -> Integers:

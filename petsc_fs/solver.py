@@ -20,6 +20,8 @@ from petsc_fs.layout import Layout
 from petsc_fs.scene import Scene
 from petsc_fs.system import FieldArrays, PatternChanged, System
 
+OWN_OPTIONS = ("petsc_fs_mat_type", "petsc_fs_restarts", "petsc_fs_true_rtol", "petsc_fs_allow_unused")
+MAT_TYPES = ("nest", "merged", "aij")
 ROUNDING_UNITS = 10
 """A residual this many times the rounding level of the system cannot be told from zero."""
 
@@ -29,7 +31,7 @@ class Result:
     """What a solve did.
 
     Attributes:
-        iterations: of the outer Krylov method.
+        iterations: of the outer Krylov method, restarts by -petsc_fs_restarts included.
         converged: whether the true residual of the untransformed system meets the tolerance.
         reason: PETSc's name of the reason why the Krylov method stopped.
         true_relative_residual: |b - J x| / |b|.
@@ -74,7 +76,10 @@ class Solver:
     """Solves a scene by what the options database says, and further scenes of the same structure.
 
     Options:
-        -petsc_fs_mat_type nest|aij: storage of the Jacobian; aij copies the blocks into one matrix.
+        -petsc_fs_mat_type nest|merged|aij: storage of the Jacobian; aij copies the blocks into one matrix,
+            merged only those of mechanics, where ContactTransform does not.
+        -petsc_fs_restarts n: how often the Krylov method may start again from its own solution where the
+            true residual misses the tolerance that its recursive estimate has met; default 2.
         -petsc_fs_true_rtol r: relative true residual that counts as converged; default -ksp_rtol.
     """
 
@@ -104,12 +109,14 @@ class Solver:
         self.layout = layout or Layout.contiguous(mpi, scene.dimension, scene.sizes)
         options = PETSc.Options(prefix)
         mat_type = options.getString("petsc_fs_mat_type", "nest")
-        if mat_type not in ("nest", "aij"):
-            raise UsageError(f"-{prefix}petsc_fs_mat_type {mat_type}: expected nest or aij")
+        if mat_type not in MAT_TYPES:
+            raise UsageError(f"-{prefix}petsc_fs_mat_type {mat_type}: expected {' or '.join(MAT_TYPES)}")
         with together(mpi):
             self.scene = scene if scene.rows is not None else scene.restrict(_ranges(self.layout))
-        self.system = System(self.scene, self.layout, mat_type=mat_type)
+        self._storage = {"mat_type": mat_type, **needed_data(prefix)}
+        self.system = System(self.scene, self.layout, **self._storage)
         self.ksp = self._create_ksp()
+        self.restarts = options.getInt("petsc_fs_restarts", 2)
         self.true_rtol = options.getReal("petsc_fs_true_rtol", self.ksp.getTolerances()[0])
         self.x = self.system.J.createVecRight()
         self._built_seconds = time.perf_counter() - started
@@ -118,11 +125,12 @@ class Solver:
         ksp = PETSc.KSP().create(self.layout.comm)
         ksp.setOptionsPrefix(self.prefix)
         ksp.setOperators(self.system.J, self.system.J)
-        ksp.setDM(self.system.dm)
-        if PETSc.Sys.getVersion() < (3, 25):
-            ksp.setDMActive(False)
-        else:
-            ksp.setDMActive(PETSc.KSP.DMActive.ALL, False)
+        if len(self.system.members) > 1:
+            ksp.setDM(self.system.dm)
+            if PETSc.Sys.getVersion() < (3, 25):
+                ksp.setDMActive(False)
+            else:
+                ksp.setDMActive(PETSc.KSP.DMActive.ALL, False)
         ksp.setFromOptions()
         ksp.setConvergenceHistory()
         return ksp
@@ -138,9 +146,8 @@ class Solver:
         try:
             self.system.update(self.scene)
         except PatternChanged:
-            mat_type = self.system.mat_type
             self.ksp.destroy()
-            self.system = System(self.scene, self.layout, mat_type=mat_type)
+            self.system = System(self.scene, self.layout, **self._storage)
             self.ksp = self._create_ksp()
         self._built_seconds = time.perf_counter() - started
 
@@ -177,17 +184,26 @@ class Solver:
             SolveError: PETSc failed on the way, or the solution is not finite.
         """
         self.set_up()
+        result = self._run(0, 0.0)
+        for _ in range(self.restarts):
+            if result.converged or not result.reason.startswith("CONVERGED") or not result.iterations:
+                break
+            self.ksp.setInitialGuessNonzero(True)
+            result = self._run(result.iterations, result.solve_seconds)
+        self.ksp.setInitialGuessNonzero(False)
+        self._built_seconds = 0.0
+        return result
+
+    def _run(self, iterations: int, seconds: float) -> Result:
+        """Solve once, from the current solution if the KSP is told so; iterations and seconds are added up."""
         started = time.perf_counter()
         try:
             self.ksp.solve(self.system.b, self.x)
         except PETSc.Error as e:
             raise SolveError(f"solve failed: {brief(e)}") from e
-        solve_seconds = time.perf_counter() - started
-        result = self._judge(solve_seconds)
-        self._built_seconds = 0.0
-        return result
+        return self._judge(iterations + self.ksp.getIterationNumber(), seconds + time.perf_counter() - started)
 
-    def _judge(self, solve_seconds: float) -> Result:
+    def _judge(self, iterations: int, solve_seconds: float) -> Result:
         system, reason = self.system, reason_name(self.ksp)
         residual = system.b.duplicate()
         system.J.mult(self.x, residual)
@@ -199,7 +215,7 @@ class Solver:
         if not np.isfinite(relative):
             hint = "; a factorisation broke down: see -ksp_view, and for MUMPS raise -mat_mumps_icntl_14 on its level"
             raise SolveError(
-                f"the solution is not finite after {self.ksp.getIterationNumber()} iterations ({reason})"
+                f"the solution is not finite after {iterations} iterations ({reason})"
                 + (hint if "PC" in reason else "")
             )
         tolerance = max(self.true_rtol, self.ksp.getTolerances()[1] / size)
@@ -210,7 +226,7 @@ class Solver:
             limited = bool(relative <= floor)
             tolerance = floor if limited else tolerance
         return Result(
-            iterations=self.ksp.getIterationNumber(),
+            iterations=iterations,
             converged=bool(relative <= tolerance),
             reason=reason,
             true_relative_residual=relative,
@@ -254,6 +270,19 @@ def set_up_leaves(pc: PETSc.PC) -> None:
             set_up_leaves(inner)
     else:
         pc.setUpOnBlocks()
+
+
+def needed_data(prefix: str) -> dict[str, bool]:
+    """Which data beside the matrix the solver in the options database makes use of, for `System`. Local."""
+    chosen = {k: str(v) for k, v in PETSc.Options().getAll().items() if k.startswith(prefix)}
+    types = {v for k, v in chosen.items() if k.endswith("pc_type")}
+    own = ("petsc_fs.pc.ContactTransform", "petsc_fs.pc.FixedStress")
+    foreign = any(k.endswith("pc_python_type") and v not in own for k, v in chosen.items())
+    nodal = any(k.endswith(("boomeramg_nodal_coarsen", "boomeramg_vec_interp_variant")) for k in chosen)
+    return {
+        "near_null_space": nodal or foreign or bool(types & {"gamg", "ml", "bddc", "hmg"}),
+        "fixed_stress": foreign or own[1] in chosen.values(),
+    }
 
 
 def _ranges(layout: Layout) -> dict[str, tuple[int, int]]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from petsc_fs.dm import Blocks, Problem, field_dm
+from petsc_fs.dm import Blocks, Problem, field_dm, field_nest, merge_mechanics, one_matrix
 from petsc_fs.errors import LayoutError, SceneError, together
 from petsc_fs.fixed_stress import analytic_coefficients
 from petsc_fs.layout import Layout
@@ -28,12 +28,22 @@ class System:
     Attributes:
         layout: distribution of the rows.
         blocks: matrices by (row field, column field), AIJ with the fields' block sizes.
-        J: the Jacobian: a MatNest over `blocks` by reference, or one AIJ.
+        J: the Jacobian: a MatNest over `members`, or one AIJ.
+        members: fields as J has them: name and the fields of the table it is made of.
         b: right-hand side, numbered as J: on each rank field by field.
-        dm: names the fields.
+        dm: names the members.
+        problem: what the DM carries.
     """
 
-    def __init__(self, scene: Scene, layout: Layout, *, mat_type: str = "nest") -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        layout: Layout,
+        *,
+        mat_type: str = "nest",
+        near_null_space: bool = True,
+        fixed_stress: bool = True,
+    ) -> None:
         """Build everything from the rows of this rank.
 
         Collective on `layout.comm`.
@@ -41,7 +51,10 @@ class System:
         Args:
             scene: whose row ranges are those of `layout` on this rank.
             layout: distribution of the rows.
-            mat_type: "nest", or "aij" for a copy in one matrix, as direct solvers need it.
+            mat_type: "nest"; "merged" for a nest in which the fields of mechanics are copied into one
+                matrix; "aij" for a copy of everything in one matrix, as direct solvers need it.
+            near_null_space: whether displacement fields get their rigid-body modes.
+            fixed_stress: whether the fixed-stress coefficients are computed.
 
         Raises:
             LayoutError: scene and layout differ.
@@ -52,7 +65,8 @@ class System:
         fields = layout.fields
         with together(layout.comm):
             self._check(scene)
-            coefficients = analytic_coefficients(scene) if "mass" in fields else None
+            self._fixed_stress = fixed_stress and "mass" in fields
+            coefficients = analytic_coefficients(scene) if self._fixed_stress else None
         pairs = list(product(fields, fields))
         entries = np.array([scene.blocks[rc].data.size if rc in scene.blocks else 0 for rc in pairs])
         entries = layout.comm.allreduce(entries)
@@ -61,13 +75,15 @@ class System:
             for rc, n in zip(pairs, entries, strict=True)
             if n or rc[0] == rc[1]
         }
-        self._nest = PETSc.Mat().createNest(
-            [[self.blocks.get((r, c)) for c in fields] for r in fields], comm=layout.comm
-        )
-        self.J = self._nest if mat_type == "nest" else self._nest.convert("aij", PETSc.Mat())
+        self.members = merge_mechanics(fields) if mat_type == "merged" else [(f, (f,)) for f in fields]
+        if mat_type == "aij" or len(self.members) == 1:
+            self.J = one_matrix(fields, self.blocks, layout)
+        else:
+            self.J = field_nest(self.members, self.blocks, layout)
         self.b = self.J.createVecLeft()
-        problem = Problem(layout, self.blocks, scene.cell_centers, coefficients, scene.contact_state)
-        self.dm = field_dm(problem, [(f, (f,)) for f in fields])
+        centers = scene.cell_centers if near_null_space else {}
+        self.problem = Problem(layout, self.blocks, centers, coefficients, scene.contact_state)
+        self.dm = field_dm(self.problem, self.members)
         self.set_rhs(scene.rhs)
 
     def update(self, scene: Scene) -> None:
@@ -79,22 +95,25 @@ class System:
             PatternChanged: an entry is outside the nonzero pattern; the system is unusable then.
             LayoutError: scene and layout differ.
         """
-        problem: Problem = self.dm.getAppCtx()[0]
         with together(self.layout.comm):
             self._check(scene)
-            if "mass" in self.layout.fields:
-                problem.fixed_stress = analytic_coefficients(scene)
+            if self._fixed_stress:
+                self.problem.fixed_stress = analytic_coefficients(scene)
             for rc, block in scene.blocks.items():
                 if block.data.size and rc not in self.blocks:
                     raise PatternChanged(f"block {rc} was empty")
             for rc, matrix in self.blocks.items():
                 _set_values(matrix, rc, scene.blocks.get(rc))
-        problem.contact_state = scene.contact_state
+        self.problem.contact_state = scene.contact_state
         for matrix in self.blocks.values():
             matrix.assemble()
-        self._nest.stateIncrease()
-        if self.J is not self._nest:
-            self._nest.convert("aij", out=self.J)
+        if self.J.getType() == "nest":
+            for k, (_, fields) in enumerate(self.members):
+                if len(fields) > 1:
+                    one_matrix(fields, self.blocks, self.layout, out=self.J.getNestSubMatrix(k, k))
+            self.J.stateIncrease()
+        else:
+            one_matrix(self.layout.fields, self.blocks, self.layout, out=self.J)
         self.set_rhs(scene.rhs)
 
     def set_rhs(self, rhs: Mapping[str, NDArray[np.float64]]) -> None:

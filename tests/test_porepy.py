@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import petsc_fs
 from petsc_fs.errors import LayoutError, SceneError, SolveError, UsageError
 from petsc_fs.porepy import export as export_module
+from petsc_fs.porepy import parity, parity_page, published_code
 from petsc_fs.porepy.cases import CASES, CELL, ModelParameters
 from petsc_fs.porepy.direct import solve
 from petsc_fs.porepy.export import BUNDLED, Steps, add_arguments, export
@@ -505,6 +506,208 @@ def test_arguments(pp, tmp_path):
     args = parser.parse_args(["flow", "--directory", str(tmp_path), "--steps", "1:0", "--refinement", "0.5"])
     export_module.run(args, lambda line: None)
     assert [p.name for p in tmp_path.iterdir()] == ["flow_g0.5_t1_n0.h5"]
+
+
+# FieldSplitSolver
+
+
+@pytest.fixture
+def field_split_model(pp):
+    """Make a model that solves by petsc_fs, or one that solves directly."""
+    from petsc_fs.porepy import FieldSplitSolver, make_model
+
+    def make(name, **params):
+        model = make_model(name, refinement=COARSE.get(name, 1), mixins=(FieldSplitSolver,))
+        model.params.update(params)
+        return model
+
+    return make
+
+
+def stop_in_time_step(number):
+    from petsc_fs.porepy.models import StopRun
+
+    def look(model, _):
+        if model.time_manager.time_index >= number:
+            raise StopRun
+
+    return look
+
+
+def first_solve(model):
+    """Record and update of the first linear solve."""
+    from petsc_fs.porepy import run
+    from petsc_fs.porepy.models import StopRun
+
+    found = []
+
+    def look(model, update):
+        found.extend([model.linear_solves[-1], update])
+        raise StopRun
+
+    run(model, on_newton_step=look)
+    return found
+
+
+@pytest.mark.parametrize("name", ["model1", "model3"])
+def test_field_split_solver_finds_the_same_state(field_split_model, name):
+    """After the first time step the unknowns are those of the direct solver, to Newton's tolerance."""
+    from petsc_fs.porepy import Adapter, make_model, run
+
+    ours, direct = field_split_model(name), make_model(name, refinement=COARSE.get(name, 1))
+    run(ours, on_newton_step=stop_in_time_step(2))
+    run(direct, on_newton_step=stop_in_time_step(2), linear_solve=lambda model: solve(*model.linear_system))
+    states = [m.equation_system.get_variable_values(time_step_index=0) for m in (ours, direct)]
+    found, expected = (Adapter(m).from_porepy(v) for m, v in zip((ours, direct), states, strict=True))
+    for field, values in expected.items():
+        assert np.linalg.norm(found[field] - values) < 1e-4 * np.linalg.norm(values), field
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_field_split_solver_records_every_solve(field_split_model, name):
+    from petsc_fs.porepy import run
+
+    seen = []
+
+    def look(model, update):
+        assert np.isfinite(update).all()
+        seen.append((model.time_manager.time_index, model.nonlinear_solver_statistics.num_iteration))
+        if name == "model3":
+            stop_in_time_step(2)(model, update)
+
+    model = field_split_model(name)
+    run(model, on_newton_step=look)
+    solves = model.linear_solves
+    assert [(s.time_step, s.newton_index) for s in solves] == seen
+    assert seen[-1][0] == (2 if name == "model3" else CASES[name].time_steps)
+    fracture_cells = sum(g.num_cells for g in model.mdg.subdomains(dim=model.nd - 1))
+    for record in solves:
+        assert record.converged
+        assert record.reason.startswith("CONVERGED")
+        assert 0 < record.iterations < 45
+        assert record.true_relative_residual < 1e-4
+        assert record.unknowns == model.equation_system.num_dofs()
+        assert sum(record.contact_states.values()) == (fracture_cells if "contact" in FIELDS[name] else 0)
+        assert 0 < record.setup_seconds + record.solve_seconds <= record.seconds
+
+
+def test_field_split_solver_is_a_mixin_for_any_model(pp, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # gmsh writes there
+    from petsc_fs.porepy import FieldSplitSolver
+
+    class Mine(FieldSplitSolver, pp.SinglePhaseFlow):
+        def bc_values_pressure(self, boundary_grid):
+            return boundary_grid.cell_centers[0]
+
+    model = Mine({"petsc_fs_options_file": "direct.opts", "times_to_export": []})
+    pp.run_time_dependent_model(model, {"progressbars": False})
+    assert [s.contact_states for s in model.linear_solves] == [{}] * len(model.linear_solves) != []
+
+
+def test_options_are_in_the_database_during_solves_only(field_split_model):
+    """What stands there goes first, as the command line does, and stays."""
+    from petsc4py import PETSc
+
+    database = PETSc.Options()
+    before = database.getAll()
+    database.setValue("ksp_max_it", 3)
+    try:
+        record, update = first_solve(field_split_model("model1"))
+        assert database.getAll() == before | {"ksp_max_it": "3"}
+    finally:
+        database.delValue("ksp_max_it")
+    assert (record.iterations, record.reason, record.converged) == (3, "DIVERGED_ITS", False)
+    assert np.isfinite(update).all()
+    database.setValue("mine_ksp_max_it", 4)
+    try:
+        record, _ = first_solve(field_split_model("model1", petsc_fs_options_prefix="mine_"))
+    finally:
+        database.delValue("mine_ksp_max_it")
+    assert record.iterations == 4
+    assert first_solve(field_split_model("model1"))[0].converged
+
+
+def test_options_file_of_a_model(field_split_model, tmp_path):
+    file = tmp_path / "typo.opts"
+    file.write_text("-ksp_type gmres\n-ksp_rtoll 1e-3\n-pc_type none\n-ksp_max_it 5\n")
+    with pytest.raises(UsageError, match=r"typo.opts: option -ksp_rtoll was not used; did you mean -ksp_rtol"):
+        first_solve(field_split_model("flow", petsc_fs_options_file=str(file)))
+    with pytest.raises(UsageError, match=r"flow.opts is for models with the fields intf_flow, mass; this one has"):
+        first_solve(field_split_model("model1", petsc_fs_options_file="flow.opts"))
+    with pytest.raises(UsageError, match="no such file"):
+        first_solve(field_split_model("flow", petsc_fs_options_file="nothing.opts"))
+
+
+# Parity with the published code
+
+SOME = [[[12, 6, 0, 0], [13, 0, 6, 0]], [[15, 3, 3, 0]]]
+
+
+def test_published_counts():
+    origin, counts = parity.published()
+    assert "d9b687b" in origin
+    assert list(counts) == list(parity.RUNS)
+    means = {name: round(parity.mean_iterations(history), 2) for name, history in counts.items()}
+    assert (means["model1_g1"], means["model2_g5"], means["model3_g1"]) == (14.45, 19.71, 26.19)
+    assert means["richardson_Kn1.2e+09_F0.577"] == 25.0
+    assert all(len(history) == CASES[parity.RUNS[name].model].time_steps for name, history in counts.items())
+
+
+@pytest.mark.parametrize(
+    ("theirs", "expected"),
+    [
+        (SOME, ((2, 2), (1, 1), (2, 2), None, ([], []))),
+        ([[[9, 6, 0, 0], [9, 0, 6, 0]], [[9, 2, 4, 0]]], ((1, 2), (1, 1), (1, 2), (2, 0), ([3, 3, 0], [2, 4, 0]))),
+        ([[[12, 6, 0, 0]], [[15, 3, 3, 0]]], ((2, 2), (0, 0), (1, 2), (1, 1), ([0, 6, 0], []))),
+    ],
+    ids=["equal", "states", "newton steps"],
+)
+def test_comparison_of_histories(theirs, expected):
+    found = parity.compare(SOME, theirs)
+    assert (found.starts, found.later, found.ends, found.first, found.first_states) == expected
+
+
+@pytest.mark.parametrize("name", ["model1_g1", "model2_g1", "richardson_Kn1.2e+09_F0.577"])
+def test_parity(pp, name):
+    lines = []
+    measured = parity.run(name, lines.append)
+    assert parity.missed({"petsc_fs": {name: measured}}) == []
+    assert measured.unconverged == 0
+    assert len(lines) == sum(len(step) for step in measured.history)
+    assert lines[0].startswith(f"{name}: time step 1, Newton step 0: {measured.history[0][0][0]} iterations, ")
+
+
+def test_parity_page(tmp_path):
+    """Results survive their file; the page has them, and what is too far off is named."""
+    _, counts = parity.published()
+    results = parity.read(tmp_path / "new.json")
+    off = [[[n + 2, *states] for n, *states in step] for step in counts["model2_g1"]]
+    for name, history in {"model1_g1": counts["model1_g1"], "model2_g1": off}.items():
+        results["petsc_fs"][name] = parity.Measured(9876, 1.5, {"PorePy": "1.11"}, history)
+    again = [[row[0] + 1 for row in step] for step in counts["model1_g1"]]
+    results["published_code"]["model1_g1"] = parity.Measured(9876, 2.5, {}, counts["model1_g1"], again)
+    parity.write(results, tmp_path / "new.json")
+    assert parity.read(tmp_path / "new.json") == results
+    (line,) = parity.missed(results)
+    assert line == "model2_g1: mean Krylov iterations differ by +2.00, allowed 1.0"
+    page = parity_page.report(results)
+    assert (
+        "| model1, refinement 1 | 9,876 | 3.67 (7 4 4 2 3 2) | 3.67 (7 4 4 2 3 2) | 14.45 | 14.45 | +0.00 | yes |"
+        in page
+    )
+    assert "| 19.53 | 17.53 | +2.00 | NO |" in page
+    assert "Of 22 systems 0 took the same number of iterations, and 22 differ by at most one" in page
+    (tmp_path / "bad.json").write_text("[]")
+    with pytest.raises(UsageError, match="not a file of parity results"):
+        parity.read(tmp_path / "bad.json")
+
+
+def test_runs_that_do_not_exist(tmp_path):
+    with pytest.raises(UsageError, match="unknown run 'model4_g1'; runs are model1_g1, "):
+        parity.find_run("model4_g1")
+    pytest.importorskip("porepy")
+    with pytest.raises(UsageError, match="not the published code"):
+        published_code.run("model1_g1", tmp_path)
 
 
 def test_a_missing_porepy_is_named(tmp_path):

@@ -7,13 +7,11 @@ from dataclasses import replace
 import numpy as np
 from petsc4py import PETSc
 
-from petsc_fs.dm import Blocks, Members, Problem, field_dm
+from petsc_fs.dm import Blocks, Members, Problem, field_dm, field_nest, merge_mechanics
 from petsc_fs.errors import LayoutError, SceneError, UsageError, together
-from petsc_fs.fields import MECHANICS, in_order
+from petsc_fs.fields import in_order
 from petsc_fs.pc.wrapper import WrapperPC, choice
-from petsc_fs.scene import CONTACT_STATES
-
-ALMOST_SINGULAR = 1e-14
+from petsc_fs.scene import CONTACT_STATES, CSR, diagonal_blocks, singular
 
 
 class ContactTransform(WrapperPC):
@@ -25,13 +23,15 @@ class ContactTransform(WrapperPC):
     - left: L = -J_12 D_22^-1, Q_l = I + L in block (1,2), J~ = Q_l J, residual r~ = Q_l r,
 
     has J~_11 = J_11 - J_12 D_22^-1 J_21, block-diagonal and invertible (paper, eq:Qright and
-    eq:J_tilde). The inner PC is set up on a MatNest with the contact column and row of J~ and, in
-    place of the other blocks, S^1 = J_ij - J~_i1 J~_11^-1 J~_1j (eq:S^1). All products are as small
-    as the fractures; other blocks of J are passed on by reference. `intf_force` and `momentum`
-    become one field `mechanics`: one AIJ matrix that keeps the block size for multigrid.
+    eq:J_tilde). With side none, for a J_11 that is invertible as it is, J~ = J.
+
+    The inner PC is set up on a MatNest with the contact column and row of J~ and, in place of the
+    other blocks, S^1 = J_ij - J~_i1 J~_11^-1 J~_1j (eq:S^1). All products are as small as the
+    fractures; other blocks of J are passed on by reference. `intf_force` and `momentum` become one
+    field `mechanics`: one AIJ matrix that keeps the block size for multigrid.
 
     Options, with the prefix of this PC:
-        -qr_side right|left: the transformation.
+        -qr_side right|left|none: the transformation.
         -qr_pc_type, ...: the inner PC, whose fields are contact, mechanics, intf_flow, mass.
 
     The operator must be a MatNest over the five fields, or those of them that a scene has.
@@ -49,7 +49,7 @@ class ContactTransform(WrapperPC):
         for needed in ("contact", "intf_force"):
             if needed not in names:
                 raise UsageError(f"ContactTransform needs a field {needed!r}; this scene has {', '.join(names)}")
-        self.side = choice(pc, "qr_side", ("right", "left"))
+        self.side = choice(pc, "qr_side", ("right", "left", "none"))
         blocks = {
             (r, c): nest.getNestSubMatrix(i, j)
             for i, r in enumerate(names)
@@ -60,20 +60,23 @@ class ContactTransform(WrapperPC):
         self._contact, self._intf_force = nest.getNestISs()[0][:2]
         inner_members = merge_mechanics(names)
         inner_problem = replace(problem, blocks=eliminated)
-        return self._nest(eliminated, inner_members, problem), field_dm(inner_problem, inner_members)
+        return field_nest(inner_members, eliminated, problem.layout), field_dm(inner_problem, inner_members)
 
     def _eliminate(self, J: Blocks, problem: Problem) -> Blocks:
         """Blocks of J~ in the row and column of contact, of S^1 elsewhere."""
-        D_inverse = block_diagonal_inverse(J["intf_force", "intf_force"], "D_22, block of intf_force", problem)
         S = dict(J)
         others = in_order(name for pair in J for name in pair)  # the same order on all ranks
+        changed = {}
+        if self.side != "none":
+            D_inverse = block_diagonal_inverse(J["intf_force", "intf_force"], "D_22, block of intf_force", problem)
         if self.side == "right":
             self._transform = D_inverse.matMult(J["intf_force", "contact"])
             changed = {(r, "contact"): (J[r, "intf_force"], self._transform) for r in others if (r, "intf_force") in J}
-        else:
+        elif self.side == "left":
             self._transform = J["contact", "intf_force"].matMult(D_inverse)
             changed = {("contact", c): (self._transform, J["intf_force", c]) for c in others if ("intf_force", c) in J}
-        self._transform.scale(-1)
+        if changed:
+            self._transform.scale(-1)
         for pair, (left, right) in changed.items():
             S[pair] = add_product(J.get(pair), left, right)
         C_inverse = block_diagonal_inverse(S["contact", "contact"], "J~_11, block of contact", problem)
@@ -86,39 +89,13 @@ class ContactTransform(WrapperPC):
                 S[r, c] = add_product(J.get((r, c)), S[r, "contact"], W)
         return S
 
-    def _nest(self, S: Blocks, members: Members, problem: Problem) -> PETSc.Mat:
-        """One MatNest over the members, mechanics assembled."""
-        comm = problem.layout.comm
-
-        def block(rows: tuple[str, ...], columns: tuple[str, ...]) -> PETSc.Mat | None:
-            grid = [[S.get((r, c)) for c in columns] for r in rows]
-            if len(rows) == len(columns) == 1:
-                return grid[0][0]
-            if not any(m for line in grid for m in line):
-                return None
-            for i, r in enumerate(rows):
-                for j, c in enumerate(columns):
-                    if grid[i][j] is None:
-                        sizes = (problem.layout.sizes(r), problem.layout.sizes(c))
-                        empty = PETSc.Mat().createAIJ(sizes, nnz=0, comm=comm)
-                        empty.assemble()
-                        grid[i][j] = empty
-            nest = PETSc.Mat().createNest(grid, comm=comm)
-            if rows != columns:
-                return nest
-            D = problem.layout.dimension
-            merged = nest.convert("aij", PETSc.Mat())
-            nest.destroy()
-            merged.setBlockSizes(D, D)
-            return merged
-
-        return PETSc.Mat().createNest([[block(r, c) for _, c in members] for _, r in members], comm=comm)
-
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Y = Q_r P^-1 x (right) or P^-1 Q_l x (left). Collective."""
         if self.side == "right":
             super().apply(pc, x, y)
             self._add(self._contact, self._intf_force, y)
+        elif self.side == "none":
+            super().apply(pc, x, y)
         else:
             work = x.copy()
             self._add(self._intf_force, self._contact, work)
@@ -134,20 +111,8 @@ class ContactTransform(WrapperPC):
 
     def describe(self) -> str:
         """The transformation in one line."""
-        where = "J Q_r" if self.side == "right" else "Q_l J"
-        return f"{self.side} transformation, inner PC on {where} with the exact Schur complement of contact"
-
-
-def merge_mechanics(names: list[str]) -> Members:
-    """Fields with those of mechanics as one member, in order."""
-    merged: list[tuple[str, tuple[str, ...]]] = []
-    mechanics = tuple(n for n in names if n in MECHANICS)
-    for name in names:
-        if name not in MECHANICS:
-            merged.append((name, (name,)))
-        elif name == mechanics[0]:
-            merged.append(("mechanics", mechanics))
-    return merged
+        where = {"right": "J Q_r", "left": "Q_l J", "none": "J"}[self.side]
+        return f"inner PC on {where} with the exact Schur complement of contact"
 
 
 def add_product(M: PETSc.Mat | None, A: PETSc.Mat, B: PETSc.Mat) -> PETSc.Mat:
@@ -174,14 +139,9 @@ def block_diagonal_inverse(A: PETSc.Mat, what: str, problem: Problem) -> PETSc.M
         raise LayoutError(f"{what}: block size is {A.getBlockSize()}, expected {D}")
     cells = n // D
     first = A.getOwnershipRange()[0]
-    indptr, indices, values = A.getDiagonalBlock().getValuesCSR()
-    rows = np.repeat(np.arange(n), np.diff(indptr))
-    inside = rows // D == indices // D
-    dense = np.zeros((cells, D, D))
-    dense[rows[inside] // D, rows[inside] % D, indices[inside] % D] = values[inside]
+    dense = diagonal_blocks(CSR(*A.getDiagonalBlock().getValuesCSR()), D)
     with together(problem.layout.comm):
-        singular_values = np.linalg.svd(dense, compute_uv=False)
-        bad = np.flatnonzero(~(singular_values[:, -1] > ALMOST_SINGULAR * singular_values[:, 0]))
+        bad = np.flatnonzero(singular(dense))
         if bad.size:
             cell = int(bad[0])
             state = ""

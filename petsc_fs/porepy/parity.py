@@ -2,7 +2,7 @@
 
 `run` takes one model to its end with `FieldSplitSolver`; `petsc_fs.porepy.published_code` runs the
 published code itself and solves each of its systems a second time with petsc_fs. Both kinds of
-results go into one JSON file, from which `report` writes the page.
+results go into one JSON file, from which `petsc_fs.porepy.parity_page` makes a page to read.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import os
 import platform
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from petsc_fs.errors import UsageError
-from petsc_fs.porepy.cases import CASES, ModelParameters
+from petsc_fs.porepy.cases import ModelParameters
 from petsc_fs.scene import CONTACT_STATES
 
 Progress = Callable[[str], None]
@@ -160,7 +160,13 @@ def append(history: History, time_step: int, row: Row) -> None:
 def line(name: str, history: History) -> str:
     """One line of progress on the last row."""
     iterations, *states = history[-1][-1]
-    return f"{name}: time step {len(history)}, Newton step {len(history[-1]) - 1}: {iterations} iterations, {_states(states)}"
+    at = f"time step {len(history)}, Newton step {len(history[-1]) - 1}"
+    return f"{name}: {at}: {iterations} iterations, {states_text(states)}"
+
+
+def states_text(counts: Sequence[int]) -> str:
+    """Numbers of cells in each contact state in words."""
+    return ", ".join(f"{n} {state}" for n, state in zip(counts, CONTACT_STATES, strict=True))
 
 
 def versions() -> dict[str, str]:
@@ -254,50 +260,48 @@ def mean_iterations(history: Sequence[Sequence[Row]]) -> float:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far two histories go together.
+    """How far two histories go together, with pairs of numbers: how many are equal, and of how many.
 
     Attributes:
-        newton_steps: that both have, counted from the start of each time step.
-        equal_states: of those, with the same number of sticking, sliding and open cells.
-        equal_iterations: of those, with the same number of Krylov iterations.
-        time_steps: that both have.
-        equal_ends: of those, whose last Newton step has the same contact states in both.
+        starts: time steps whose first Newton step has the same contact states in both.
+        later: the other Newton steps that both have, with the same contact states.
+        ends: time steps whose last Newton step has the same contact states in both.
         first: time step from 1 and Newton step from 0 of the first difference in the states, or in
             the number of Newton steps; None if there is none.
         first_states: at that Newton step in the one and in the other; empty where the time step is over.
     """
 
-    newton_steps: int
-    equal_states: int
-    equal_iterations: int
-    time_steps: int
-    equal_ends: int
+    starts: tuple[int, int]
+    later: tuple[int, int]
+    ends: tuple[int, int]
     first: tuple[int, int] | None
     first_states: tuple[Row, Row]
 
 
 def compare(ours: History, theirs: History) -> Agreement:
-    """Compare two histories Newton step by Newton step."""
-    pairs = [(a, b) for x, y in zip(ours, theirs, strict=False) for a, b in zip(x, y, strict=False)]
+    """Compare the contact states of two histories Newton step by Newton step."""
+    steps = list(zip(ours, theirs, strict=False))
+    equal = [[a[1:] == b[1:] for a, b in zip(x, y, strict=False)] for x, y in steps]
     first = None
     first_states: tuple[Row, Row] = ([], [])
-    for t, (x, y) in enumerate(zip(ours, theirs, strict=False), start=1):
-        at = next((n for n, (a, b) in enumerate(zip(x, y, strict=False)) if a[1:] != b[1:]), None)
-        if at is None and len(x) != len(y):
-            at = min(len(x), len(y))
-        if at is not None:
-            first = t, at
+    for t, ((x, y), same) in enumerate(zip(steps, equal, strict=True)):
+        at = same.index(False) if False in same else len(same)
+        if at < max(len(x), len(y)):
+            first = t + 1, at
             first_states = (x[at][1:] if at < len(x) else [], y[at][1:] if at < len(y) else [])
             break
     return Agreement(
-        newton_steps=len(pairs),
-        equal_states=sum(a[1:] == b[1:] for a, b in pairs),
-        equal_iterations=sum(a[0] == b[0] for a, b in pairs),
-        time_steps=min(len(ours), len(theirs)),
-        equal_ends=sum(x[-1][1:] == y[-1][1:] for x, y in zip(ours, theirs, strict=False) if x and y),
+        starts=_count(same[:1] for same in equal),
+        later=_count(same[1:] for same in equal),
+        ends=_count([x[-1][1:] == y[-1][1:]] for x, y in steps),
         first=first,
         first_states=first_states,
     )
+
+
+def _count(parts: Iterable[list[bool]]) -> tuple[int, int]:
+    flat = [same for part in parts for same in part]
+    return sum(flat), len(flat)
 
 
 def missed(results: Results) -> list[str]:
@@ -309,211 +313,3 @@ def missed(results: Results) -> list[str]:
         if abs(difference) > RUNS[name].tolerance:
             lines.append(f"{name}: mean Krylov iterations differ by {difference:+.2f}, allowed {RUNS[name].tolerance}")
     return lines
-
-
-def report(results: Results) -> str:
-    """The page on parity, in Markdown; all its numbers come from the results."""
-    origin, reference = published()
-    own = {name: results["petsc_fs"][name] for name in RUNS if name in results["petsc_fs"]}
-    rerun = {name: results["published_code"][name] for name in RUNS if name in results["published_code"]}
-    models = {name: measured for name, measured in own.items() if not name.startswith("richardson")}
-    richardson = {name: measured for name, measured in own.items() if name not in models}
-    parts = [
-        "# Parity with the published code",
-        "<!-- Written by scripts/parity from parity.json; do not edit. -->",
-        f'"Published" is: {origin}. "petsc_fs" is `petsc_fs.porepy.FieldSplitSolver` on one rank in '
-        "PorePy models of the same set-up, with Newton running on its iterative solutions. Krylov iterations are "
-        "PETSc's iteration number, which is one less than the length of the residual history that the published "
-        "code keeps; means are over all linear solves of a run.",
-        "## Models 1 to 3\n\n`options/contact_poromechanics.opts`: GMRES to a relative residual of 1e-10, "
-        "multigrid and ILU(0).",
-        _model_table(models, reference),
-        "## Fixed-stress Richardson\n\nModel 1 at refinement 1 with restricted physics, "
-        "`options/fixed_stress_richardson.opts`. K_n is the normal stiffness of the fracture, F its friction "
-        "coefficient.",
-        _model_table(richardson, reference),
-    ]
-    if rerun:
-        parts += ["## The same linear systems", _same_systems_text(rerun), _same_systems_table(rerun)]
-    parts += ["## Newton step by Newton step", _steps_text(bool(rerun)), _steps_table(own, rerun, reference)]
-    differences = list(_first_differences(own, rerun, reference))
-    if differences:
-        parts.append("First difference of each run from the published one:\n\n" + "\n".join(differences))
-    parts += ["## How it was run", _how(own, rerun)]
-    return "\n\n".join(parts) + "\n"
-
-
-def _model_table(runs: Mapping[str, Measured], reference: Mapping[str, History]) -> str:
-    rows = []
-    for name, measured in runs.items():
-        ours, theirs = measured.history, reference[name]
-        difference = mean_iterations(ours) - mean_iterations(theirs)
-        rows.append(
-            [
-                _title(name),
-                f"{measured.unknowns:,}",
-                _newton(ours),
-                _newton(theirs),
-                f"{mean_iterations(ours):.2f}",
-                f"{mean_iterations(theirs):.2f}",
-                f"{difference:+.2f}",
-                "yes" if abs(difference) <= RUNS[name].tolerance else "NO",
-            ]
-        )
-    allowed = {RUNS[name].tolerance for name in runs}
-    within = f"within {allowed.pop():g}" if len(allowed) == 1 else "within"
-    headings = ["run", "unknowns", "Newton steps", "published", "mean Krylov", "published", "difference", within]
-    return _table(headings, rows)
-
-
-def _title(name: str) -> str:
-    parameters = RUNS[name].parameters
-    if name.startswith("richardson"):
-        return f"K_n = {parameters.normal_stiffness:g}, F = {parameters.friction:g}"
-    return f"{RUNS[name].model}, refinement {parameters.refinement:g}"
-
-
-def _newton(history: History) -> str:
-    """Mean number of Newton steps a time step, and the number in each."""
-    counts = [len(step) for step in history]
-    return f"{np.mean(counts):.2f} ({' '.join(map(str, counts))})"
-
-
-def _same_systems_text(rerun: Mapping[str, Measured]) -> str:
-    solves = sum(len(step) for measured in rerun.values() for step in measured.again)
-    differences = [d for measured in rerun.values() for d in _again_differences(measured)]
-    equal = sum(d == 0 for d in differences)
-    return (
-        "The published code was run with its own PorePy, its own preconditioner and its own Newton iteration, and "
-        "each of its linear systems was solved a second time by petsc_fs: the same matrix and right-hand side, so "
-        f"nothing but the solver differs. Of {solves} systems {equal} took the same number of iterations, and "
-        f"{sum(abs(d) <= 1 for d in differences)} differ by at most one; the largest difference is "
-        f"{max(map(abs, differences))}."
-    )
-
-
-def _again_differences(measured: Measured) -> list[int]:
-    """Iterations of petsc_fs minus those of the published code, system by system."""
-    pairs = zip(measured.again, measured.history, strict=True)
-    return [n - row[0] for again, step in pairs for n, row in zip(again, step, strict=True)]
-
-
-def _same_systems_table(rerun: Mapping[str, Measured]) -> str:
-    rows = []
-    for name, measured in rerun.items():
-        differences = _again_differences(measured)
-        rows.append(
-            [
-                _title(name),
-                str(len(differences)),
-                f"{mean_iterations(measured.history):.2f}",
-                f"{np.mean([n for step in measured.again for n in step]):.2f}",
-                str(sum(d == 0 for d in differences)),
-                str(max(map(abs, differences))),
-            ]
-        )
-    headings = ["run", "systems", "published code", "petsc_fs", "equal counts", "largest difference"]
-    return _table(headings, rows)
-
-
-def _steps_text(rerun: bool) -> str:
-    text = (
-        "Two runs of the same model part company sooner or later: the matrices' condition numbers are about 1e17, so "
-        "that solutions to 1e-10 in the residual differ in their leading digits in some unknowns, and a fracture "
-        "cell near the edge of a contact state falls on either side. From there on the Newton iterates differ. The "
-        "table counts Newton steps that both runs have (paired from the start of each time step) with equal numbers "
-        "of sticking, sliding and open cells, and time steps whose last Newton step has equal ones."
-    )
-    if rerun:
-        text += (
-            " Its last columns compare the published code with itself: run for the published counts, and run again "
-            "on the machine of this page. That is the agreement to be expected of a perfect copy."
-        )
-    return text
-
-
-def _steps_table(own: Mapping[str, Measured], rerun: Mapping[str, Measured], reference: Mapping[str, History]) -> str:
-    headings = ["run", "equal states", "equal ends"]
-    if rerun:
-        headings += [
-            "with the rerun: equal states",
-            "equal ends",
-            "rerun with published: equal states",
-            "equal ends",
-        ]
-    rows = []
-    for name, measured in own.items():
-        row = [_title(name), *_equal(compare(measured.history, reference[name]))]
-        if name in rerun:
-            row += _equal(compare(measured.history, rerun[name].history))
-            row += _equal(compare(rerun[name].history, reference[name]))
-        rows.append(row + [""] * (len(headings) - len(row)))
-    return _table(headings, rows)
-
-
-def _equal(agreement: Agreement) -> list[str]:
-    return [
-        f"{agreement.equal_states} of {agreement.newton_steps}",
-        f"{agreement.equal_ends} of {agreement.time_steps}",
-    ]
-
-
-def _first_differences(
-    own: Mapping[str, Measured], rerun: Mapping[str, Measured], reference: Mapping[str, History]
-) -> Iterator[str]:
-    for name, measured in own.items():
-        found = compare(measured.history, reference[name])
-        if found.first is None:
-            yield f"- {_title(name)}: none, all contact states and Newton steps are equal."
-            continue
-        ours, theirs = (_states(s) if s else "none (converged)" for s in found.first_states)
-        text = (
-            f"- {_title(name)}: time step {found.first[0]}, Newton step {found.first[1]}: {ours}; published: {theirs}"
-        )
-        if name in rerun:
-            t, n = found.first
-            step = rerun[name].history[t - 1]
-            text += f"; published code run again: {_states(step[n][1:]) if n < len(step) else 'none (converged)'}"
-        yield text + "."
-
-
-def _states(counts: Sequence[int]) -> str:
-    return ", ".join(f"{n} {state}" for n, state in zip(counts, CONTACT_STATES, strict=True))
-
-
-def _how(own: Mapping[str, Measured], rerun: Mapping[str, Measured]) -> str:
-    lines = [
-        "- `scripts/parity RUN...` makes the runs and adds their results to `docs/parity.json`; "
-        "`scripts/parity --write docs/parity.md` writes this page from them.",
-        "- `scripts/parity --published-code DIR RUN...` runs the published code in DIR with the PorePy that Python "
-        "finds, and solves its systems again.",
-        "- Set-up: " + "; ".join(f"{name}: {_loads(name)}" for name in ("model1", "model2", "model3")) + ".",
-    ]
-    for label, runs in (("petsc_fs", own), ("The published code", rerun)):
-        for text in sorted({_versions_text(m.versions) for m in runs.values()}):
-            lines.append(f"- {label} ran with {text}, on one rank.")
-    for label, runs in (("petsc_fs", own), ("published code and petsc_fs after it", rerun)):
-        for name, measured in runs.items():
-            if measured.unconverged:
-                lines.append(
-                    f"- {_title(name)} ({label}): {measured.unconverged} solves of petsc_fs missed the tolerance."
-                )
-    if not any(m.unconverged for m in [*own.values(), *rerun.values()]):
-        lines.append("- All solves of petsc_fs met their tolerance in the true residual.")
-    return "\n".join(lines)
-
-
-def _loads(name: str) -> str:
-    case = CASES[name]
-    steps = f"{case.time_steps} steps of {case.time_step:g} s"
-    return f"{case.traction:g} Pa traction, {case.shear:g} Pa shear, {case.pressure_ratio:g} times the pressure in the east, {steps}"
-
-
-def _versions_text(found: Mapping[str, str]) -> str:
-    return ", ".join(f"{program} {version}" for program, version in found.items())
-
-
-def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table; the first column is text, the others are numbers."""
-    rule = ["---", *["--:"] * (len(headings) - 1)]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in [headings, rule, *rows])

@@ -113,7 +113,7 @@ class FieldSplitSolver:
             solver = self._updated_solver(scene)
             result = solver.solve()
             if not self.linear_solves:
-                self._refuse_unused(scene, solver)
+                self._refuse_unused(scene)
         update = self._adapter.to_porepy(result.solution)
         states = scene.contact_state
         self.linear_solves.append(
@@ -166,7 +166,7 @@ class FieldSplitSolver:
             self._solver.update(scene)
         return self._solver
 
-    def _refuse_unused(self, scene: Scene, solver: Solver) -> None:
+    def _refuse_unused(self, scene: Scene) -> None:
         """Raise a UsageError if an option of the file did nothing."""
         prefix, file = self._options_prefix, self._options_file(scene)
         useless = {prefix + name for name in options.parse(file)} & set(options.unused())
