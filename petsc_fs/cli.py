@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 
     from petsc_fs.scene import Scene
     from petsc_fs.solver import Result, Solver
+    from petsc_fs.tree import Tree
+
+CANONICAL = "contact_poromechanics.opts"
+"""Options file with all levels, from which `solve` and `options` cut the smallest tree for a scene."""
 
 SECONDS_TO_AGREE = 5.0
 """How long ranks wait for each other after an error before they take the others for stuck."""
@@ -136,6 +140,13 @@ def _parser() -> argparse.ArgumentParser:
     inspect.add_argument("scene", metavar="SCENE")
     inspect.add_argument("--plot", type=Path, metavar="FILE", help="draw the block structure (.png, .svg, .pdf)")
 
+    options = add("options", "print the options file of the smallest solver for a scene", _options)
+    options.add_argument("scene", metavar="SCENE")
+
+    lint = add("lint", "check an options file without solving", _lint, epilog=LINT_EPILOG)
+    lint.add_argument("file", metavar="FILE", help="options file, or the name of a shipped one")
+    lint.add_argument("scene", metavar="SCENE", nargs="?", help="scene it is for; default a bundled one that fits")
+
     convert = add("convert", "turn a scene into PETSc's binary format, or back", _convert, epilog=CONVERT_EPILOG)
     convert.add_argument("source", metavar="SOURCE", help="scene (.h5), or folder in PETSc's format")
     convert.add_argument("target", metavar="TARGET", help="folder to write, or scene (.h5)")
@@ -149,6 +160,11 @@ def _parser() -> argparse.ArgumentParser:
     add_arguments(export)
     return parser
 
+
+LINT_EPILOG = """\
+The solver is set up on the scene but does not run. Found are: lines PETSc would stop at, options that
+nothing asks for (with the closest valid names), prefixes that match no split, levels without an explicit
+ksp_type or pc_type, and values that PETSc rejects. Exit code 2 if there is any of it."""
 
 CONVERT_EPILOG = """\
 The folder holds matrix.petsc (MatLoad), rhs.petsc and, if known, reference.petsc (VecLoad), one
@@ -168,6 +184,7 @@ def _solve(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> i
             if target is not None and not target.absolute().parent.is_dir():
                 raise UsageError(f"{target}: the folder {target.absolute().parent} does not exist")
         petsc, options_file = _with_options_file(petsc, tuple(sizes))
+        typed = {word[1:] for word in petsc if word.startswith("-") and not _is_number(word)}
 
     import petsc4py
 
@@ -182,9 +199,17 @@ def _solve(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> i
     with together(comm):
         scene = hdf5.read(path, lambda *_: {f: layout.rows(f) for f in layout.fields})
     read_seconds = time.perf_counter() - started
+    tree = None
+    if options_file is None:
+        tree = tree_for(scene, comm)
+        options.insert_all(tree.options)
     solver = Solver(scene, comm, layout=layout)
     result = solver.solve()
-    _refuse_unused(given, comm)
+    with together(comm):
+        useless = options.refused([name for name in options.unused() if name in given])
+        if useless:
+            left_out = tree.left_out if tree is not None else ()
+            raise UsageError(options.explain(useless, typed, options_file, left_out))
 
     everything = solver.system.gather(result.solution)
     with together(comm):
@@ -194,6 +219,7 @@ def _solve(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> i
             result,
             path=path,
             options_file=options_file,
+            tree=tree,
             read_seconds=read_seconds,
             database=PETSc.Options().getAll(),
         )
@@ -208,8 +234,16 @@ def _solve(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> i
     return 0 if result.converged else 1
 
 
-def _with_options_file(petsc: list[str], fields: tuple[str, ...]) -> tuple[list[str], Path]:
-    """PETSc's arguments with every options file found and checked; the default one if none is named."""
+def tree_for(scene: Scene, comm: MPI.Intracomm) -> Tree:
+    """The smallest solver tree for a scene, from the canonical options file. Collective."""
+    from petsc_fs import options
+    from petsc_fs.tree import Facts, smallest_tree
+
+    return smallest_tree(options.parse(options.find_options_file(CANONICAL)), Facts.of(scene, comm))
+
+
+def _with_options_file(petsc: list[str], fields: tuple[str, ...]) -> tuple[list[str], Path | None]:
+    """PETSc's arguments with every options file found and checked, and the first of them."""
     from petsc_fs import options
 
     petsc = list(petsc)
@@ -221,8 +255,7 @@ def _with_options_file(petsc: list[str], fields: tuple[str, ...]) -> tuple[list[
             files.append(options.find_options_file(petsc[i + 1]))
             petsc[i + 1] = str(files[-1])
     if not files:
-        files = [options.default_for(fields)]
-        petsc = ["-options_file", str(files[0]), *petsc]
+        return petsc, None
     for file in files:
         options.parse(file)
     header = options.read_header(files[0])
@@ -234,29 +267,14 @@ def _with_options_file(petsc: list[str], fields: tuple[str, ...]) -> tuple[list[
     return petsc, files[0]
 
 
-def _refuse_unused(given: list[str], comm: MPI.Intracomm) -> None:
-    """Raise a UsageError on all ranks if an option that the user gave did nothing."""
-    from petsc_fs import options
-
-    useless = comm.bcast([name for name in options.unused() if name in given])
-    if not useless:
-        return
-    valid = {"petsc_fs_mat_type", "petsc_fs_true_rtol", *options.known_names()} - set(useless)
-    lines = []
-    for name in useless:
-        similar = options.closest(name, valid)
-        hint = f"; did you mean {' or '.join('-' + s for s in similar)}?" if similar else ""
-        lines.append(f"option -{name} was not used{hint}")
-    raise UsageError("; ".join(lines) if len(lines) < 2 else "\n  ".join([f"{len(lines)} options:", *lines]))
-
-
 def _report(
     scene: Scene,
     solver: Solver,
     result: Result,
     *,
     path: Path,
-    options_file: Path,
+    options_file: Path | None,
+    tree: Tree | None,
     read_seconds: float,
     database: dict[str, str],
 ) -> dict[str, Any]:
@@ -288,7 +306,8 @@ def _report(
         "read_seconds": read_seconds,
         "setup_seconds": result.setup_seconds,
         "solve_seconds": result.solve_seconds,
-        "options_file": options_file.name,
+        "options_file": options_file.name if options_file is not None else None,
+        "left_out": [str(part) for part in tree.left_out] if tree is not None else [],
         "options": database,
         "versions": {
             **hdf5.versions(),
@@ -316,6 +335,38 @@ def _inspect(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) ->
     if comm.rank == 0:
         print("\n".join(lines), flush=True)
     return 0
+
+
+def _options(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
+    from petsc_fs import hdf5
+
+    with together(comm):
+        path = find_scene(args.scene)
+        scene = hdf5.read(path)
+    if comm.rank == 0:
+        from mpi4py import MPI
+
+        tree = tree_for(scene, MPI.COMM_SELF)
+        print(tree.text(f"The smallest solver for {path.name}, cut from {CANONICAL}"), end="", flush=True)
+    return 0
+
+
+def _lint(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
+    from petsc_fs import lint, options
+
+    if comm.size > 1:
+        raise UsageError("lint runs on one rank; start it without mpiexec")
+    file = options.find_options_file(args.file)
+    if args.scene is not None:
+        scenes = [find_scene(args.scene)]
+    else:
+        scenes = sorted((Path(__file__).parent / "scenes").glob("*.h5"))
+    found = lint.lint(file, scenes)
+    for line in found:
+        print(line, file=sys.stderr)
+    if not found:
+        print(f"{file}: nothing to complain about")
+    return UsageError.exit_code if found else 0
 
 
 def _convert(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:

@@ -5,18 +5,32 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import difflib
+import fnmatch
 import itertools
 import os
 import re
 import sys
 import sysconfig
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from petsc_fs.errors import UsageError
 from petsc_fs.fields import FIELD_NAMES, in_order
+
+if TYPE_CHECKING:
+    from petsc_fs.tree import LeftOut
+
+OWN = ("petsc_fs_mat_type", "petsc_fs_restarts", "petsc_fs_true_rtol")
+"""Options of `petsc_fs.solver.Solver`."""
+
+SPLIT = r"(?<!pc_)fieldsplit_(?:intf_force|intf_flow|[A-Za-z]+|\d+)_"
+"""The prefix of one split in an option name, but not PCFIELDSPLIT's own `pc_fieldsplit_0_fields`."""
+
+ALLOW_UNUSED = "petsc_fs_allow_unused"
+"""Option with patterns, such as `my_*`, of options that may do nothing, separated by commas."""
 
 
 def shipped_folder() -> Path:
@@ -139,10 +153,15 @@ def insert(path: Path, prefix: str = "") -> None:
     Raises:
         UsageError: see `parse`.
     """
+    insert_all(parse(path), prefix)
+
+
+def insert_all(values: Mapping[str, str | None], prefix: str = "") -> None:
+    """Put options into PETSc's database, except those that are set there already. Local."""
     from petsc4py import PETSc
 
     database = PETSc.Options()
-    for name, value in parse(path).items():
+    for name, value in values.items():
         if not database.hasName(prefix + name):
             database.setValue(prefix + name, value)
 
@@ -178,7 +197,8 @@ def known_names() -> set[str]:
     """
     from petsc4py import PETSc
 
-    chosen = PETSc.Options().getAll()
+    idle = set(unused())
+    chosen = {name: value for name, value in PETSc.Options().getAll().items() if name not in idle}
     types = {name: value for name, value in chosen.items() if name.endswith("_type") and value != "python"}
     found = set(chosen)
     for prefix in {m[1] for name in chosen if (m := re.fullmatch("(|.*_)(ksp|pc)_type", name))}:
@@ -222,5 +242,49 @@ def _explain(types: Mapping[str, str]) -> set[str]:
 
 
 def closest(name: str, valid: Iterable[str]) -> list[str]:
-    """Up to three valid names that look most like a misspelt one."""
-    return difflib.get_close_matches(name, list(valid), n=3, cutoff=0.8)
+    """Up to three valid names that look most like a misspelt one, or that say the same of another split."""
+    others = sorted(set(valid) - {name})
+    tail = re.split(SPLIT, name)[-1]
+    return difflib.get_close_matches(name, others, n=3, cutoff=0.8) or [v for v in others if v.endswith(tail)][:3]
+
+
+def refused(names: Iterable[str]) -> list[str]:
+    """Those of some unused options that -petsc_fs_allow_unused does not let pass. Local."""
+    from petsc4py import PETSc
+
+    patterns = PETSc.Options().getString(ALLOW_UNUSED, "").split(",")
+    return [n for n in names if n != ALLOW_UNUSED and not any(fnmatch.fnmatchcase(n, p) for p in patterns)]
+
+
+def explain(
+    useless: Sequence[str],
+    typed: Iterable[str] = (),
+    file: Path | None = None,
+    left_out: Iterable[LeftOut] = (),
+) -> str:
+    """Say of each option that did nothing where it came from, why it did nothing, and what it might have meant.
+
+    Args:
+        useless: names without the dash.
+        typed: names on the command line.
+        file: the options file.
+        left_out: levels of the canonical tree that the scene does not need.
+    """
+    in_file = parse(file) if file is not None else {}
+    valid = (known_names() | set(OWN)) - set(useless)
+    lines = []
+    for name in useless:
+        if name in typed:
+            origin = "the command line"
+        elif name in in_file and file is not None:
+            origin = file.name
+        elif re.search(rf"(^|\s)-{re.escape(name)}(\s|$)", os.environ.get("PETSC_OPTIONS", "")):
+            origin = "PETSC_OPTIONS"
+        else:
+            origin = "a .petscrc file or the program"
+        gone = next((part for part in left_out if name.startswith(part.prefixes)), None) if left_out else None
+        reason = f": its level is not there ({gone})" if gone is not None and gone.prefixes else ""
+        similar = closest(name, valid)
+        hint = f"; did you mean {' or '.join('-' + s for s in similar)}?" if similar else ""
+        lines.append(f"option -{name} from {origin} was not used{reason}{hint}")
+    return lines[0] if len(lines) == 1 else "\n  ".join([f"{len(lines)} options were not used:", *lines])

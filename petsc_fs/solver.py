@@ -15,12 +15,11 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from petsc_fs.errors import PetscFsError, SolveError, UsageError, together
+from petsc_fs.errors import SolveError, UsageError, together
 from petsc_fs.layout import Layout
 from petsc_fs.scene import Scene
 from petsc_fs.system import FieldArrays, PatternChanged, System
 
-OWN_OPTIONS = ("petsc_fs_mat_type", "petsc_fs_restarts", "petsc_fs_true_rtol", "petsc_fs_allow_unused")
 MAT_TYPES = ("nest", "merged", "aij")
 ROUNDING_UNITS = 10
 """A residual this many times the rounding level of the system cannot be told from zero."""
@@ -165,15 +164,6 @@ class Solver:
         except PETSc.Error as e:
             raise SolveError(f"set-up failed: {brief(e)}") from e
         self._built_seconds += time.perf_counter() - started
-
-    def queried_options(self) -> None:
-        """Set an identical solver up and throw it away: for `petsc_fs.options.queried`. Collective."""
-        ksp = self._create_ksp()
-        try:
-            ksp.setUp()
-        except (PETSc.Error, PetscFsError):
-            pass
-        ksp.destroy()
 
     def solve(self) -> Result:
         """Solve for the right-hand side of the scene, from a zero initial guess. Collective.

@@ -33,8 +33,10 @@ def solve_table(scene: Scene, report: dict[str, Any]) -> str:
         verdict += ", to the limit of rounding"
     lines = [
         f"{verdict}: true residual {report['true_relative_residual']:.2e}, tolerance {report['tolerance']:.2e}",
-        f"{report['iterations']} iterations ({report['reason']}) by {report['options_file']}"
+        f"{report['iterations']} iterations ({report['reason']}) by "
+        f"{report['options_file'] or 'the smallest solver for the scene'}"
         f" on {report['ranks']} rank{'s' if report['ranks'] > 1 else ''}",
+        *report["left_out"],
         ", ".join(f"{what} {report[key]:.3f} s" for what, key in PHASES),
     ]
     return "\n".join([_title(scene, report["scene"]), _text(table) + "\n".join(lines)])

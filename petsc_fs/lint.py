@@ -1,0 +1,91 @@
+"""Checks of options files against the solver they describe."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from petsc_fs import hdf5, options
+from petsc_fs.errors import PetscFsError, UsageError
+
+if TYPE_CHECKING:
+    from petsc4py import PETSc
+
+
+def lint(file: Path, scenes: Sequence[Path]) -> list[str]:
+    """Everything wrong with an options file, one line each.
+
+    Initialises PETSc, puts the file into its options database, and sets the solver up on the first scene
+    that has the fields of the file's header; it does not solve.
+
+    Args:
+        file: options file.
+        scenes: to choose from.
+
+    Raises:
+        UsageError: no scene fits.
+    """
+    try:
+        chosen = options.parse(file)
+    except UsageError as e:
+        return [str(e)]
+    header = options.read_header(file)
+    scene = next((s for s in scenes if header.fits(hdf5.read_sizes(s)[1])), None)
+    if scene is None:
+        raise UsageError(f"{file}: none of the scenes has the fields {', '.join(header.fields)}; name one")
+
+    import petsc4py
+
+    petsc4py.init(["petsc-fs"])
+    from petsc4py import PETSc
+
+    from petsc_fs.solver import Solver, brief
+
+    options.insert_all(chosen)
+    found = [f"{file}: {problem}" for problem in _levels_without_types(chosen)]
+    try:
+        solver = Solver(hdf5.read(scene))
+        solver.set_up()
+    except PETSc.Error as e:
+        return [*found, f"{file}: PETSc refuses a value: {brief(e)}"]
+    except PetscFsError as e:
+        return [*found, f"{file}: the solver cannot be set up: {e}"]
+    useless = options.refused([name for name in options.unused() if name in chosen])
+    splits = set(_option_prefixes(solver.ksp.getPC()))
+    for name in useless:
+        missing = next((p for p in _split_prefixes(name) if p not in splits), None)
+        if missing is None:
+            found.append(f"{file}: {options.explain([name], file=file)}")
+        else:
+            similar = options.closest(missing, splits)
+            hint = f"; there is {' and '.join('-' + s for s in similar)}" if similar else ""
+            found.append(f"{file}: option -{name}: no split has the prefix -{missing}{hint}")
+    solver.destroy()
+    return found
+
+
+def _levels_without_types(chosen: Mapping[str, str | None]) -> Iterator[str]:
+    """Splits that leave their KSP or PC to PETSc's defaults."""
+    for prefix in sorted({p for name in chosen for p in _split_prefixes(name)}):
+        for kind, default in (("ksp_type", "GMRES"), ("pc_type", "ILU or block Jacobi")):
+            if f"{prefix}{kind}" not in chosen:
+                yield f"level -{prefix} has no {kind}; PETSc would take {default}: name it"
+
+
+def _split_prefixes(name: str) -> list[str]:
+    """The prefixes of splits in an option name, outermost first."""
+    return [name[: m.end()] for m in re.finditer(options.SPLIT, name)]
+
+
+def _option_prefixes(pc: PETSc.PC) -> Iterator[str]:
+    """Prefixes of a set-up PC and all PCs in it."""
+    yield pc.getOptionsPrefix() or ""
+    if pc.getType() == "fieldsplit":
+        for ksp in pc.getFieldSplitSubKSP():
+            yield from _option_prefixes(ksp.getPC())
+    elif pc.getType() == "python":
+        inner = getattr(pc.getPythonContext(), "inner", None)
+        if inner is not None:
+            yield from _option_prefixes(inner)

@@ -1,0 +1,354 @@
+"""The command line as a user meets it: exit codes, one clear line per error, whole files or none.
+
+Every command runs in a process of its own, on one rank and on two, with a limit of time: a hang is a failure.
+"""
+
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from sample import SCENES
+
+import petsc_fs
+from petsc_fs import hdf5, options
+from petsc_fs.cli import find_scene, split_arguments
+from petsc_fs.errors import SceneError
+from petsc_fs.scene import contact_state_counts
+
+MPIEXEC = Path(petsc_fs.__path__[0]).parent / "scripts" / "mpiexec"
+LIMIT = 60
+MISSPELT = "-qr_fieldsplit_1_fieldsplit_mechanics_pc_hypre_boomeramg_stong_threshold"
+ENVIRONMENT = dict(os.environ, OMP_NUM_THREADS="1")
+"""As this session was started: MPI has added to what a process below it would get otherwise."""
+
+Done = subprocess.CompletedProcess[str]
+
+
+def run(*arguments: object, cwd: Path, ranks: int = 1) -> Done:
+    """`petsc-fs` with these arguments in a folder."""
+    command = [sys.executable, "-m", "petsc_fs", *map(str, arguments)]
+    if ranks > 1:
+        command = [str(MPIEXEC), "-n", str(ranks), *command]
+    return subprocess.run(command, cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=LIMIT, check=False)
+
+
+def ours(done: Done, ranks: int) -> list[str]:
+    """Lines on stderr, without those that mpiexec adds about ranks that exit with an error."""
+    lines = done.stderr.splitlines()
+    return lines if ranks == 1 else [line for line in lines if "petsc" in line.lower() or "Traceback" in line]
+
+
+# Scenes and options files that are wrong in one way
+
+
+@pytest.fixture(scope="module")
+def wrong(tmp_path_factory) -> Path:
+    """A folder full of them."""
+    folder = tmp_path_factory.mktemp("wrong")
+    (folder / "text.h5").write_text("fields: mass\n" * 100)
+    whole = (SCENES / "flow.h5").read_bytes()
+    (folder / "truncated.h5").write_bytes(whole[: len(whole) // 2])
+    with edited("flow.h5", folder / "nan.h5") as file:
+        file["blocks/mass/mass/data"][5] = np.nan
+    with edited("flow.h5", folder / "short.h5") as file:
+        replace(file, "fields/mass/rhs", file["fields/mass/rhs"][:-1])
+    with edited("contact.h5", folder / "singular.h5") as file:
+        zero_diagonal_block(file["blocks/intf_force/intf_force"], cell=17, size=2)
+    with edited("flow.h5", folder / "newer.h5") as file:
+        file.attrs["encoding-version"] = 2
+    (folder / "syntax.opts").write_text("# mine\n-ksp_type gmres\nksp_rtol 1e-8\n")
+    (folder / "binary.opts").write_bytes(whole[:500])
+    return folder
+
+
+def edited(name: str, target: Path) -> h5py.File:
+    """A copy of a bundled scene, open."""
+    return h5py.File(shutil.copy(SCENES / name, target), "r+")
+
+
+def replace(group: h5py.Group, name: str, values: np.ndarray) -> None:
+    del group[name]
+    group.create_dataset(name, data=values, compression="gzip", shuffle=True)
+
+
+def zero_diagonal_block(group: h5py.Group, cell: int, size: int) -> None:
+    rows = np.repeat(np.arange(group["indptr"].size - 1), np.diff(group["indptr"]))
+    inside = (rows // size == cell) & (group["indices"][:] // size == cell)
+    assert inside.sum() == size * size
+    replace(group, "data", np.where(inside, 0.0, group["data"]))
+
+
+FAILURES = {
+    "missing_scene": (3, ["solve", "nowhere.h5"], ["nowhere.h5: no such file", "model1.h5"]),
+    "scene_is_text": (3, ["solve", "text.h5"], ["text.h5: not an HDF5 file"]),
+    "scene_is_a_folder": (3, ["solve", "."], ["is a directory, not a scene"]),
+    "truncated_scene": (3, ["solve", "truncated.h5"], ["truncated.h5: the file is truncated"]),
+    "newer_scene": (3, ["solve", "newer.h5"], ["written in version 2", "update petsc_fs"]),
+    "nan": (3, ["solve", "nan.h5"], ["block (mass, mass): row 0", "not finite"]),
+    "short_field": (3, ["solve", "short.h5"], ["mass: rhs has 1125 entries, expected 1126"]),
+    "singular_D22": (3, ["solve", "singular.h5"], ["D_22, block of intf_force: singular at cell 17"]),
+    "inspect_nan": (3, ["inspect", "nan.h5"], ["block (mass, mass): row 0", "not finite"]),
+    "missing_options_file": (
+        2,
+        ["solve", "flow.h5", "-options_file", "nowhere.opts"],
+        ["options file nowhere.opts: no such file; shipped are", "flow.opts"],
+    ),
+    "options_file_is_no_text": (
+        2,
+        ["solve", "flow.h5", "-options_file", "binary.opts"],
+        ["options file binary.opts: not readable as text"],
+    ),
+    "options_file_with_syntax_error": (
+        2,
+        ["solve", "flow.h5", "-options_file", "syntax.opts"],
+        ["syntax.opts:3: 'ksp_rtol' is not an option; options start with '-'"],
+    ),
+    "options_file_without_name": (2, ["solve", "flow.h5", "-options_file"], ["name of the file is missing"]),
+    "options_file_for_other_fields": (
+        2,
+        ["solve", "flow.h5", "-options_file", "poromechanics.opts"],
+        ["poromechanics.opts is for scenes with the fields momentum, mass; this one has intf_flow, mass"],
+    ),
+    "misspelt_option": (
+        2,
+        ["solve", "model1.h5", MISSPELT, "0.7"],
+        [f"option {MISSPELT} was not used; did you mean {MISSPELT.replace('stong', 'strong')}"],
+    ),
+    "misspelt_own_option": (
+        2,
+        ["solve", "model1.h5", "-qr_sidee", "left"],
+        ["option -qr_sidee was not used; did you mean -qr_side?"],
+    ),
+    "impossible_value": (2, ["solve", "flow.h5", "-petsc_fs_mat_type", "foo"], ["foo: expected nest or aij"]),
+    "wrong_subcommand": (2, ["slove", "flow.h5"], ["invalid choice: 'slove' (choose from 'solve', "]),
+    "no_scene": (2, ["solve"], ["the following arguments are required: SCENE"]),
+    "petsc_option_elsewhere": (2, ["inspect", "flow.h5", "-ksp_view"], ["-ksp_view: PETSc options go with 'solve'"]),
+    "report_into_missing_folder": (
+        2,
+        ["solve", "flow.h5", "--report", "nowhere/report.json"],
+        ["nowhere/report.json: the folder", "does not exist"],
+    ),
+    "report_over_a_folder": (2, ["solve", "flow.h5", "--report", "folder"], ["folder: cannot be written"]),
+    "save_over_a_folder": (2, ["solve", "flow.h5", "--save", "folder"], ["folder: cannot be written"]),
+}
+
+
+@pytest.mark.parametrize("ranks", [1, 2], ids=["1_rank", "2_ranks"])
+@pytest.mark.parametrize(("code", "arguments", "fragments"), FAILURES.values(), ids=FAILURES)
+def test_an_error_is_one_clear_line_and_leaves_no_file(wrong, tmp_path, code, arguments, fragments, ranks):
+    for word in arguments:
+        if (wrong / word).is_file():
+            (tmp_path / word).symlink_to(wrong / word)
+    (tmp_path / "folder").mkdir()
+    before = sorted(p.name for p in tmp_path.rglob("*"))
+    if arguments[0] == "solve" and len(arguments) > 1:
+        extra = {"--report": "report.json", "--save": "solution.h5"}
+        order = [w for k, v in extra.items() if k not in arguments for w in (k, v)]
+        arguments = [*order, *arguments] if "folder" not in arguments else arguments
+    done = run(*arguments, cwd=tmp_path, ranks=ranks)
+    lines = ours(done, ranks)
+    assert [line.startswith("petsc-fs: ") for line in lines] == [True], done.stderr
+    assert all(text in lines[0] for text in fragments), lines[0]
+    assert (done.returncode, done.stdout) == (code, "")
+    assert sorted(p.name for p in tmp_path.rglob("*")) == before
+
+
+def test_several_unused_options_are_all_named(tmp_path):
+    done = run("solve", "flow.h5", "-ksp_rtoll", "1e-3", "-zzzzzzzz", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == [
+        "petsc-fs: 2 options:",
+        "  option -ksp_rtoll was not used; did you mean -ksp_rtol or -ksp_atol?",
+        "  option -zzzzzzzz was not used",
+    ]
+
+
+@pytest.mark.parametrize("ranks", [1, 2], ids=["1_rank", "2_ranks"])
+def test_a_solve_that_stops_early_is_reported_and_exits_1(tmp_path, ranks):
+    done = run("solve", "biot.h5", "-ksp_max_it", 2, "--report", "r.json", cwd=tmp_path, ranks=ranks)
+    assert (done.returncode, ours(done, ranks)) == (1, [])
+    assert "NOT CONVERGED" in done.stdout
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert (report["converged"], report["iterations"], report["reason"]) == (False, 2, "DIVERGED_MAX_IT")
+    assert report["true_relative_residual"] > report["tolerance"]
+
+
+@pytest.mark.parametrize("ranks", [1, 2], ids=["1_rank", "2_ranks"])
+def test_the_report_says_what_was_done_and_how_well(tmp_path, ranks):
+    done = run("solve", "--report", "r.json", "model1.h5", "-ksp_max_it", 80, cwd=tmp_path, ranks=ranks)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert [p.name for p in tmp_path.iterdir()] == ["r.json"]
+    report = json.loads((tmp_path / "r.json").read_text())
+    scene = hdf5.read(SCENES / "model1.h5")
+    assert report["scene"] == "model1.h5"
+    assert report["fields"] == scene.sizes
+    assert (report["ranks"], report["dimension"]) == (ranks, 2)
+    assert (report["converged"], report["reason"][:9]) == (True, "CONVERGED")
+    assert isinstance(report["iterations"], int)
+    assert 5 < report["iterations"] < 30
+    assert 0 < report["true_relative_residual"] <= report["tolerance"]
+    for what in ("residual_by_field", "error_by_field"):
+        assert list(report[what]) == list(scene.fields)
+        assert all(isinstance(v, float) for v in report[what].values())
+    squares = sum(v**2 for v in report["residual_by_field"].values())
+    assert np.sqrt(squares) == pytest.approx(report["true_relative_residual"])
+    for what in ("read_seconds", "setup_seconds", "solve_seconds"):
+        assert 0 < report[what] < LIMIT
+    assert report["options_file"] == "contact_poromechanics.opts"
+    shipped = options.parse(options.shipped_folder() / "contact_poromechanics.opts")
+    assert report["options"] == {**shipped, "ksp_max_it": "80"}
+    assert {"petsc_fs", "petsc", "hdf5", "python", "numpy"} <= set(report["versions"])
+    assert f"{report['iterations']} iterations" in done.stdout
+    assert all(f in done.stdout for f in scene.fields)
+
+
+@pytest.mark.parametrize("ranks", [1, 2], ids=["1_rank", "2_ranks"])
+def test_the_saved_solution_is_the_reference(tmp_path, ranks):
+    done = run("solve", "contact.h5", "--save", "x.h5", "-ksp_rtol", 1e-11, cwd=tmp_path, ranks=ranks)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert [p.name for p in tmp_path.iterdir()] == ["x.h5"]
+    scene = hdf5.read(SCENES / "contact.h5")
+    with h5py.File(tmp_path / "x.h5") as file:
+        assert set(file) == set(scene.fields)
+        for f, reference in scene.reference.items():
+            assert np.linalg.norm(file[f] - reference) < 1e-6 * np.linalg.norm(reference)
+
+
+def test_a_file_in_the_way_is_replaced_whole(tmp_path):
+    (tmp_path / "r.json").write_text("x" * 100000)
+    assert run("solve", "flow.h5", "--report", "r.json", cwd=tmp_path).returncode == 0
+    assert json.loads((tmp_path / "r.json").read_text())["scene"] == "flow.h5"
+
+
+def test_own_options_files_are_taken_beside_shipped_ones(tmp_path):
+    (tmp_path / "mine.opts").write_text("-ksp_rtol 1e-3\n")
+    arguments = ["-options_file", "flow.opts", "-options_file", "mine.opts", "--report", "r.json"]
+    assert run("solve", "flow.h5", *arguments, cwd=tmp_path).returncode == 0
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert (report["options"]["ksp_rtol"], report["tolerance"]) == ("1e-3", 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--help"], ["solve", "inspect", "convert", "export", "two dashes"]),
+        (["solve", "-h"], ["--report", "--save", "-options_file", "exit codes: 0 ", "1 it does not", "3 a scene"]),
+        (["inspect", "--help"], ["SCENE", "--plot"]),
+        (["convert", "--help"], ["SOURCE", "TARGET", "matrix.petsc", "--dimension"]),
+        (["export", "--help"], ["--steps", "--out"]),
+    ],
+    ids=["main", "solve", "inspect", "convert", "export"],
+)
+def test_help_names_what_there_is(tmp_path, arguments, words):
+    done = run(*arguments, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert [word for word in words if word not in done.stdout] == []
+
+
+def test_help_is_printed_once(tmp_path):
+    done = run("--help", cwd=tmp_path, ranks=2)
+    assert (done.returncode, done.stdout.count("usage: ")) == (0, 1)
+
+
+@pytest.mark.parametrize("ranks", [1, 2], ids=["1_rank", "2_ranks"])
+def test_inspect_shows_fields_and_contact_states_once(tmp_path, ranks):
+    done = run("inspect", "model2.h5", cwd=tmp_path, ranks=ranks)
+    assert (done.returncode, done.stderr) == (0, "")
+    scene = hdf5.read(SCENES / "model2.h5")
+    rows = [line.replace("│", " ").split() for line in done.stdout.splitlines()]
+    for f, size in scene.sizes.items():
+        assert sum(row[:1] == [f] and f"{size:,}" in row for row in rows) >= 1
+        entries = [f"{scene.blocks[f, c].data.size:,}" if (f, c) in scene.blocks else "." for c in scene.fields]
+        assert [f, *entries] in rows
+    states = ", ".join(f"{n} {state}" for state, n in contact_state_counts(scene.contact_state).items())
+    assert done.stdout.count(f"contact states: {states}\n") == 1
+    assert "kg = 1e+10" in done.stdout
+    assert "porepy 1.11" in done.stdout
+
+
+def test_inspect_may_be_cut_off_by_a_pipe(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "petsc_fs", "inspect", "flow.h5"],
+        cwd=tmp_path,
+        env=ENVIRONMENT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    process.stdout.close()
+    assert (process.stderr.read(), process.wait(LIMIT)) == (b"", 0)
+
+
+needs_matplotlib = pytest.mark.skipif(importlib.util.find_spec("matplotlib") is None, reason="no matplotlib")
+
+
+@needs_matplotlib
+def test_inspect_draws_a_picture(tmp_path):
+    done = run("inspect", "contact.h5", "--plot", "blocks.png", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.endswith("block structure drawn in blocks.png\n")
+    picture = (tmp_path / "blocks.png").read_bytes()
+    assert picture[:8] == b"\x89PNG\r\n\x1a\n"
+    assert len(picture) > 10000
+
+
+@needs_matplotlib
+@pytest.mark.parametrize("target", ["blocks.nonsense", "nowhere/blocks.png"])
+def test_a_picture_that_cannot_be_drawn_is_an_error(tmp_path, target):
+    done = run("inspect", "flow.h5", "--plot", target, cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert done.stderr.startswith(f"petsc-fs: {target}: cannot be drawn: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["convert", "export"])
+def test_commands_for_one_rank_say_so(tmp_path, command):
+    arguments = ["flow.h5", "folder"] if command == "convert" else ["model1"]
+    done = run(command, *arguments, cwd=tmp_path, ranks=2)
+    assert done.returncode == 2
+    assert len(ours(done, 2)) == 1
+    assert f"petsc-fs: {command} runs on one rank" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(importlib.util.find_spec("porepy") is not None, reason="PorePy is installed")
+def test_export_without_porepy_says_how_to_get_it(tmp_path):
+    done = run("export", "model1", "--out", "scenes", cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert done.stderr.startswith("petsc-fs: ")
+    assert "pip install" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+# In this process
+
+
+@pytest.mark.parametrize(
+    ("words", "own", "petsc"),
+    [
+        ("solve a.h5", "solve a.h5", ""),
+        ("solve a.h5 -ksp_view -ksp_rtol 1e-3", "solve a.h5", "-ksp_view -ksp_rtol 1e-3"),
+        ("solve a.h5 -s -1 -2.5e3 x --save b.h5", "solve a.h5 --save b.h5", "-s -1 -2.5e3 x"),
+        ("solve --save b.h5 a.h5 -k", "solve --save b.h5 a.h5", "-k"),
+        ("solve -k 3 --report=r.json", "solve --report=r.json", "-k 3"),
+        ("solve -k 3 -h", "solve -h", "-k 3"),
+    ],
+)
+def test_one_dash_is_petscs_and_two_are_ours(words, own, petsc):
+    assert split_arguments(words.split()) == (own.split(), petsc.split())
+
+
+def test_a_scene_is_found_by_path_or_by_bundled_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert find_scene("flow.h5") == SCENES / "flow.h5"
+    assert find_scene(str(SCENES / "flow.h5")) == SCENES / "flow.h5"
+    Path("flow.h5").write_text("mine")
+    assert find_scene("flow.h5") == Path("flow.h5")
+    with pytest.raises(SceneError, match="nowhere/flow.h5: no such file; bundled scenes are biot.h5, "):
+        find_scene("nowhere/flow.h5")
