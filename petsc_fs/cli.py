@@ -338,15 +338,14 @@ def _inspect(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) ->
 
 
 def _options(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
+    from mpi4py import MPI
+
     from petsc_fs import hdf5
 
     with together(comm):
         path = find_scene(args.scene)
-        scene = hdf5.read(path)
+        tree = tree_for(hdf5.read(path), MPI.COMM_SELF)
     if comm.rank == 0:
-        from mpi4py import MPI
-
-        tree = tree_for(scene, MPI.COMM_SELF)
         print(tree.text(f"The smallest solver for {path.name}, cut from {CANONICAL}"), end="", flush=True)
     return 0
 

@@ -148,6 +148,8 @@ class Solver:
             self.ksp.destroy()
             self.system = System(self.scene, self.layout, **self._storage)
             self.ksp = self._create_ksp()
+        self.ksp.setOperators(self.system.J, self.system.J)  # or KSPSetUp leaves the set-up to the first product
+        collect_garbage(self.layout.comm)
         self._built_seconds = time.perf_counter() - started
 
     def set_up(self) -> None:
@@ -246,6 +248,11 @@ class Solver:
         if self.ksp is not None:
             self.ksp.destroy()
             self.ksp = None
+
+
+def collect_garbage(comm: MPI.Intracomm) -> None:
+    """Free what Python has let go of: petsc4py keeps it until all ranks come together. Collective."""
+    PETSc.garbage_cleanup(comm)
 
 
 def set_up_leaves(pc: PETSc.PC) -> None:

@@ -166,7 +166,7 @@ def test_the_table_of_defaults_is_complete():
 
 @pytest.mark.parametrize("fields", [["contact"], ["mass", "contact"], []], ids=lambda f: "+".join(f) or "none")
 def test_other_fields_have_no_default(fields):
-    with pytest.raises(UsageError, match="no default solver for the fields .*: name one with -options_file"):
+    with pytest.raises(UsageError, match=r"no default solver for the fields .*: name one with -options_file"):
         options.default_for(fields)
 
 
@@ -197,14 +197,19 @@ def test_options_are_unused_until_somebody_asks(database):
     assert "tst_two" in options.unused()
 
 
+def use(prefix: str) -> None:
+    """Let a KSP take its options."""
+    ksp = PETSc.KSP().create(PETSc.COMM_SELF)
+    ksp.setOptionsPrefix(prefix)
+    ksp.setFromOptions()
+    ksp.destroy()
+
+
 @pytest.mark.mpi
 def test_a_solver_uses_its_options_and_no_others(database):
     database["tst_ksp_type"], database["tst_pc_type"], database["tst_pc_tpye"] = "cg", "jacobi", "ilu"
-    ksp = PETSc.KSP().create(PETSc.COMM_SELF)
-    ksp.setOptionsPrefix("tst_")
-    ksp.setFromOptions()
+    use("tst_")
     assert [name for name in options.unused() if name.startswith("tst_")] == ["tst_pc_tpye"]
-    ksp.destroy()
 
 
 LONG = "fieldsplit_1_fieldsplit_mechanics_" * 3
@@ -217,12 +222,15 @@ def test_known_names_are_those_that_petsc_explains(database, capfd, prefix):
     chosen = {"ksp_type": "gmres", "pc_type": "hypre", "pc_hypre_type": "boomeramg"}
     for name, value in chosen.items():
         database[prefix + name] = value
+    database[prefix + "ksp_rotl"] = "1"
+    use(prefix)
     before = database.getAll()
     names = options.known_names()
     expected = {*chosen, "ksp_rtol", "ksp_gmres_restart", "pc_hypre_boomeramg_strong_threshold"}
     assert {prefix + name for name in expected} <= names
     assert prefix + "pc_hypre_boomeramg_stong_threshold" not in names
     assert prefix + "pc_gamg_threshold" not in names
+    assert prefix + "ksp_rotl" not in names
     assert names == options.known_names()
     assert database.getAll() == before
     assert capfd.readouterr() == ("", "")
@@ -233,6 +241,8 @@ def test_known_names_survive_types_that_do_not_exist(database, capfd):
     database["tst_ksp_type"], database["tst_pc_type"] = "gmrse", "python"
     database["tst_pc_python_type"] = "no_such_module.PC"
     database["tst_sub_ksp_type"] = "cg"
+    for name in database.getAll():
+        database.getString(name, "")
     assert {"tst_ksp_type", "tst_pc_python_type", "tst_sub_ksp_rtol"} <= options.known_names()
     assert capfd.readouterr() == ("", "")
 

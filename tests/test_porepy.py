@@ -503,7 +503,7 @@ def test_direct_solver():
 def test_arguments(pp, tmp_path):
     parser = argparse.ArgumentParser()
     add_arguments(parser)
-    args = parser.parse_args(["flow", "--directory", str(tmp_path), "--steps", "1:0", "--refinement", "0.5"])
+    args = parser.parse_args(["flow", "--out", str(tmp_path), "--steps", "1:0", "--refine", "0.5"])
     export_module.run(args, lambda line: None)
     assert [p.name for p in tmp_path.iterdir()] == ["flow_g0.5_t1_n0.h5"]
 
