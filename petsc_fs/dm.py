@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from petsc_fs.errors import UsageError
 from petsc_fs.fields import MECHANICS
 from petsc_fs.layout import Layout
 from petsc_fs.scene import Integers
@@ -88,6 +89,10 @@ def field_dm(problem: Problem, members: Members) -> PETSc.DMShell:
 
     def create_sub_dm(_: PETSc.DM, ids: Sequence[int]) -> tuple[PETSc.IS, PETSc.DM]:
         numbers = [int(i) for i in ids]
+        wrong = [i for i in numbers if not 0 <= i < len(members)]
+        if wrong:
+            names = ", ".join(f"{i} {name}" for i, (name, _) in enumerate(members))
+            raise UsageError(f"-pc_fieldsplit_N_fields: no field {wrong[0]} at this level; fields are {names}")
         return index_set(numbers), sub_dm(numbers)
 
     dm.setCreateFieldDecomposition(decomposition)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import atexit
+import gc
 import itertools
 import re
+import sys
 import time
 import weakref
 from dataclasses import dataclass, field
@@ -19,6 +21,9 @@ from petsc_fs.errors import SolveError, UsageError, together
 from petsc_fs.layout import Layout
 from petsc_fs.scene import Scene
 from petsc_fs.system import FieldArrays, PatternChanged, System
+
+REFUSALS = (62, 63, 86)
+"""PETSc's codes for a wrong argument, one out of range and an unknown type: what bad options give."""
 
 MAT_TYPES = ("nest", "merged", "aij")
 ROUNDING_UNITS = 10
@@ -68,6 +73,10 @@ def _destroy_live() -> None:
     """Free what Python PCs hold while Python still runs: PetscFinalize comes after it."""
     for solver in sorted(_live, key=lambda s: s._number):
         solver.destroy()
+    for name in ("last_exc", "last_value", "last_traceback", "last_type"):  # of an error nobody caught
+        if hasattr(sys, name):
+            delattr(sys, name)
+    gc.collect()
     PETSc.garbage_cleanup()
 
 
@@ -130,7 +139,11 @@ class Solver:
                 ksp.setDMActive(False)
             else:
                 ksp.setDMActive(PETSc.KSP.DMActive.ALL, False)
-        ksp.setFromOptions()
+        try:
+            ksp.setFromOptions()
+        except (PETSc.Error, ImportError) as e:
+            ksp.destroy()
+            raise UsageError(f"PETSc refuses an option: {brief(e)}") from e
         ksp.setConvergenceHistory()
         return ksp
 
@@ -163,7 +176,11 @@ class Solver:
         try:
             self.ksp.setUp()
             set_up_leaves(self.ksp.getPC())
+        except ImportError as e:
+            raise UsageError(f"PETSc refuses an option: {brief(e)}") from e
         except PETSc.Error as e:
+            if e.ierr in REFUSALS:
+                raise UsageError(f"PETSc refuses an option: {brief(e)}") from e
             raise SolveError(f"set-up failed: {brief(e)}") from e
         self._built_seconds += time.perf_counter() - started
 
@@ -248,6 +265,7 @@ class Solver:
         if self.ksp is not None:
             self.ksp.destroy()
             self.ksp = None
+            collect_garbage(self.layout.comm)
 
 
 def collect_garbage(comm: MPI.Intracomm) -> None:
@@ -293,8 +311,10 @@ def reason_name(ksp: PETSc.KSP) -> str:
     return str(names.get(number, number))
 
 
-def brief(error: PETSc.Error) -> str:
-    """One line of a PETSc error: its code's text and the innermost message."""
+def brief(error: Exception) -> str:
+    """One line of an error; of one of PETSc's, its code's text and the innermost message."""
+    if not isinstance(error, PETSc.Error):
+        return str(error)
     lines = [re.sub(r"^\[\d+\]\s*", "", line).strip() for line in str(error).splitlines()]
     messages = [line for line in lines if line and not re.match(r"\w+\(\) (line|at)", line)]
     return "; ".join(messages) or f"error code {error.ierr}"

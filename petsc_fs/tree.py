@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from petsc_fs.errors import UsageError
+from petsc_fs.errors import UsageError, together
 from petsc_fs.fields import MECHANICS
 from petsc_fs.fixed_stress import analytic_coefficients
 from petsc_fs.scene import Scene, singular_diagonal_blocks
@@ -91,12 +91,17 @@ class Facts:
 
     @property
     def needs_fixed_stress(self) -> bool:
-        """Whether the Schur complement of mechanics differs from the mass block."""
-        return bool(self.mechanics) and "mass" in self.fields and self.fixed_stress and not self.decoupled
+        """Whether the Schur complement of mechanics differs from the mass block: both must act on each other."""
+        both_ways = self.flow_moves_rock and self.rock_moves_flow
+        return bool(self.mechanics) and "mass" in self.fields and self.fixed_stress and both_ways
 
     @classmethod
     def of(cls, scene: Scene, comm: MPI.Intracomm) -> Facts:
-        """Look at a scene, or at the rows of it that each rank has. Collective."""
+        """Look at a scene, or at the rows of it that each rank has. Collective.
+
+        Raises:
+            SceneError: the material data are impossible.
+        """
 
         def entries(rows: tuple[str, ...], columns: tuple[str, ...]) -> int:
             return sum(
@@ -108,7 +113,8 @@ class Facts:
             block = scene.blocks.get(("contact", "contact"))
             start, stop = scene.row_range("contact")
             singular = (stop - start) if block is None else singular_diagonal_blocks(block, scene.dimension, start)
-        coefficients = analytic_coefficients(scene) if "mass" in scene.sizes else None
+        with together(comm):
+            coefficients = analytic_coefficients(scene) if "mass" in scene.sizes else None
         counts = np.array(
             [
                 entries(("contact",), ("intf_force",)),
@@ -212,7 +218,12 @@ def _left_out(facts: Facts) -> Iterator[LeftOut]:
     if not facts.flow:
         yield LeftOut("the second and third Schur levels", "no flow", (f"{REST}fieldsplit_1_",))
     elif facts.mechanics and not facts.needs_fixed_stress:
-        reason = "mechanics and flow decoupled" if facts.decoupled else "fixed-stress diagonal zero"
+        if facts.decoupled:
+            reason = "mechanics and flow decoupled"
+        elif facts.flow_moves_rock and facts.rock_moves_flow:
+            reason = "fixed-stress diagonal zero"
+        else:
+            reason = "mechanics and flow act one way only"
         prefixes = tuple(f"{REST}fieldsplit_1_{name}" for name in (*STRESS_OPTIONS, "pc_python_type"))
         yield LeftOut("fixed stress", reason, prefixes)
     if facts.flow == ("mass",):

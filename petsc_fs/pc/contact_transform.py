@@ -148,8 +148,9 @@ def block_diagonal_inverse(A: PETSc.Mat, what: str, problem: Problem) -> PETSc.M
             if "contact" in what and problem.contact_state is not None:
                 state = f" ({CONTACT_STATES[int(problem.contact_state[cell])]})"
             raise SceneError(
-                f"{what}: singular at cell {first // D + cell}{state}, and at {bad.size - 1} more on this rank; "
-                "the contact unknowns cannot be eliminated"
+                f"{what}: singular at cell {first // D + cell}{state}"
+                + (f", and at {bad.size - 1} more on this rank" if bad.size > 1 else "")
+                + "; the contact unknowns cannot be eliminated"
             )
     inverse = np.linalg.inv(dense)
     columns = first + (np.arange(cells) * D)[:, None, None] + np.zeros((D, 1), dtype=np.int64) + np.arange(D)

@@ -24,16 +24,20 @@ _HOME = {
 }
 
 
+class PorePyMissingError(UsageError, ImportError):
+    """PorePy cannot be imported."""
+
+
 def require_porepy() -> Any:
     """The module porepy.
 
     Raises:
-        UsageError: it cannot; the message says how to install it.
+        PorePyMissingError: it cannot; the message says how to install it.
     """
     try:
         return import_module("porepy")
     except ImportError as e:
-        raise UsageError(
+        raise PorePyMissingError(
             f'PorePy is not installed ({e}); pip install "porepy @ git+https://github.com/pmgbergen/porepy@v1.11"'
         ) from e
 

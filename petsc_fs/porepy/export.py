@@ -29,7 +29,7 @@ Floats = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 BUNDLED = {
-    "model1": (2.0, "3:0"),
+    "model1": (2.0, "mixed@6"),
     "model2": (2.0, "3:2"),
     "model3": (0.25, "2:1"),
     "biot": (2.0, "1:0"),
