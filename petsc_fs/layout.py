@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -54,6 +54,10 @@ class Layout:
                 raise LayoutError(f"{name}: expected one number of cells for each of {comm.size} ranks")
             offsets[name] = FIELD[name].block_size(dimension) * np.concatenate([[0], np.cumsum(counts)])
         return cls(comm, dimension, offsets)
+
+    def only(self, fields: Iterable[str]) -> Layout:
+        """The same layout for some of the fields."""
+        return Layout(self.comm, self.dimension, {f: self.offsets[f] for f in in_order(fields)})
 
     @property
     def fields(self) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -307,6 +307,27 @@ class Scene:
                     raise SceneError(f"material: {name} is not finite")
             if not (np.isfinite(self.material.time_step) and self.material.time_step > 0):
                 raise SceneError(f"material: time_step must be positive, found {self.material.time_step}")
+
+    def only(self, fields: Iterable[str]) -> Scene:
+        """The part of a scene with these fields, its rows and columns; the rest is forgotten."""
+        names = in_order(f for f in fields if f in self.sizes)
+
+        def part(values: dict[str, Any]) -> dict[str, Any]:
+            return {f: values[f] for f in names if f in values}
+
+        return replace(
+            self,
+            sizes=part(self.sizes),
+            blocks={(r, c): b for (r, c), b in self.blocks.items() if r in names and c in names},
+            rhs=part(self.rhs),
+            reference=part(self.reference),
+            cell_centers=part(self.cell_centers),
+            cell_volumes=part(self.cell_volumes),
+            cell_dimension=self.cell_dimension if "mass" in names else None,
+            contact_state=self.contact_state if "contact" in names else None,
+            material=self.material if "mass" in names else None,
+            rows=None if self.rows is None else part(self.rows),
+        )
 
     def restrict(self, rows: Mapping[str, tuple[int, int]]) -> Scene:
         """The part of a whole scene that one rank holds.

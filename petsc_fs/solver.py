@@ -114,13 +114,14 @@ class Solver:
         self.ksp: Any = None
         self._number = next(_numbers)
         _live.add(self)
-        self.layout = layout or Layout.contiguous(mpi, scene.dimension, scene.sizes)
+        whole = layout or Layout.contiguous(mpi, scene.dimension, scene.sizes)
+        self.layout = whole.only(f for f in whole.fields if whole.sizes(f)[1])
         options = PETSc.Options(prefix)
         mat_type = options.getString("petsc_fs_mat_type", "nest")
         if mat_type not in MAT_TYPES:
             raise UsageError(f"-{prefix}petsc_fs_mat_type {mat_type}: expected {' or '.join(MAT_TYPES)}")
         with together(mpi):
-            self.scene = scene if scene.rows is not None else scene.restrict(_ranges(self.layout))
+            self.scene = self._part(scene)
         self._storage = {"mat_type": mat_type, **needed_data(prefix)}
         self.system = System(self.scene, self.layout, **self._storage)
         self.ksp = self._create_ksp()
@@ -128,6 +129,11 @@ class Solver:
         self.true_rtol = options.getReal("petsc_fs_true_rtol", self.ksp.getTolerances()[0])
         self.x = self.system.J.createVecRight()
         self._built_seconds = time.perf_counter() - started
+
+    def _part(self, scene: Scene) -> Scene:
+        """The rows of this rank, of the fields that have any unknowns."""
+        part = scene.only(self.layout.fields)
+        return part if part.rows is not None else part.restrict({f: self.layout.rows(f) for f in self.layout.fields})
 
     def _create_ksp(self) -> PETSc.KSP:
         ksp = PETSc.KSP().create(self.layout.comm)
@@ -154,7 +160,7 @@ class Solver:
         """
         started = time.perf_counter()
         with together(self.layout.comm):
-            self.scene = scene if scene.rows is not None else scene.restrict(_ranges(self.layout))
+            self.scene = self._part(scene)
         try:
             self.system.update(self.scene)
         except PatternChanged:
@@ -298,10 +304,6 @@ def needed_data(prefix: str) -> dict[str, bool]:
         "near_null_space": nodal or foreign or bool(types & {"gamg", "ml", "bddc", "hmg"}),
         "fixed_stress": foreign or own[1] in chosen.values(),
     }
-
-
-def _ranges(layout: Layout) -> dict[str, tuple[int, int]]:
-    return {f: layout.rows(f) for f in layout.fields}
 
 
 def reason_name(ksp: PETSc.KSP) -> str:

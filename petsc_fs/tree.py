@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from petsc_fs.errors import UsageError, together
-from petsc_fs.fields import MECHANICS
+from petsc_fs.fields import FIELD_NAMES, MECHANICS
 from petsc_fs.fixed_stress import analytic_coefficients
 from petsc_fs.scene import Scene, singular_diagonal_blocks
 
@@ -78,6 +78,11 @@ class Facts:
     def flow(self) -> tuple[str, ...]:
         """Fields of flow."""
         return tuple(f for f in FLOW if f in self.fields)
+
+    @property
+    def published(self) -> bool:
+        """Whether these are the equations that the published runs solve, with their absolute tolerance."""
+        return self.fields == FIELD_NAMES
 
     @property
     def needs_transform(self) -> bool:
@@ -189,6 +194,8 @@ def smallest_tree(canonical: Mapping[str, str | None], facts: Facts) -> Tree:
         node = _split(level_1, "contact", leaf, node, members) if members else leaf
     node = _without_ksp(node)
     outer = {k: v for k, v in canonical.items() if k.startswith(("ksp_", "petsc_fs_"))}
+    if not facts.published:
+        outer.pop("ksp_atol", None)
     if facts.needs_transform:
         wrapper = {k: canonical[k] for k in ("pc_type", "pc_python_type", "qr_side") if k in canonical}
         node = {**wrapper, **({} if facts.contact_singular else {"qr_side": "none"}), **_put("qr_", node)}
@@ -226,6 +233,8 @@ def _left_out(facts: Facts) -> Iterator[LeftOut]:
             reason = "mechanics and flow act one way only"
         prefixes = tuple(f"{REST}fieldsplit_1_{name}" for name in (*STRESS_OPTIONS, "pc_python_type"))
         yield LeftOut("fixed stress", reason, prefixes)
+    if not facts.published:
+        yield LeftOut("the absolute tolerance of the published runs", "not their five equations", ("ksp_atol",))
     if facts.flow == ("mass",):
         prefixes = (f"{REST}fieldsplit_1_fs_fieldsplit_intf_flow_",)
         yield LeftOut("the third Schur level", "no interface flow", prefixes)

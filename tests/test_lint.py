@@ -20,9 +20,7 @@ POROMECHANICS = (options.shipped_folder() / "poromechanics.opts").read_text()
 
 def lint(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "petsc_fs", "lint", *map(str, arguments)]
-    return subprocess.run(
-        command, cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=LIMIT, check=False
-    )
+    return subprocess.run(command, cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=LIMIT, check=False)
 
 
 @pytest.mark.parametrize("file", options.shipped(), ids=lambda f: f.path.stem)
@@ -51,8 +49,14 @@ BROKEN = {
             f"did you mean -{MECHANICS}pc_hypre_boomeramg_strong_threshold"
         ],
     ),
-    "misspelt_value": (edited(GOOD, "-pc_type hypre\n", "-pc_type hyper\n"), ["mine.opts: ", "PETSc refuses", "Unable to find requested PC type hyper"]),
-    "no_number": (edited(GOOD, "-ksp_rtol 1e-10", "-ksp_rtol abc"), ["mine.opts: ", "PETSc refuses", "Input string abc has no numeric value"]),
+    "misspelt_value": (
+        edited(GOOD, "-pc_type hypre\n", "-pc_type hyper\n"),
+        ["mine.opts: ", "PETSc refuses", "Unable to find requested PC type hyper"],
+    ),
+    "no_number": (
+        edited(GOOD, "-ksp_rtol 1e-10", "-ksp_rtol abc"),
+        ["mine.opts: ", "PETSc refuses", "Input string abc has no numeric value"],
+    ),
     "no_ksp_type": (
         edited(GOOD, "-ksp_type preonly\n      -pc_type hypre", "-pc_type hypre"),
         [f"level -{MECHANICS} has no ksp_type; PETSc would take GMRES: name it"],

@@ -247,22 +247,13 @@ def test_fixed_stress_diagonal_is_the_formula(clean):
     expected = np.select([scene.cell_dimension == 2, scene.cell_dimension == 1], [l_mat * scale, l_frac * scale], 0.0)
     assert (scene.cell_dimension == 0).any()
 
-    bare = replace(only(scene, ("mass",)), blocks={("mass", "mass"): csr(1e-30 * np.eye(scene.sizes["mass"]))})
+    bare = replace(scene.only(["mass"]), blocks={("mass", "mass"): csr(1e-30 * np.eye(scene.sizes["mass"]))})
     system = system_of(bare)
     pc = python_pc(system, "FixedStress", "f_", fs_damping="1", fs_pc_type="none")
     S = pc.getPythonContext().inner.getOperators()[1]
     S = gathered(S.getNestSubMatrix(0, 0) if S.getType() == "nest" else S)
     np.testing.assert_allclose(S, np.diag(expected), rtol=1e-9, atol=1e-29)
     pc.destroy()
-
-
-def only(scene: Scene, fields: tuple[str, ...]) -> Scene:
-    """The part of a scene with these fields."""
-    keep = {"rhs", "reference", "cell_centers", "cell_volumes", "sizes"}
-    parts = {k: {f: v for f, v in getattr(scene, k).items() if f in fields} for k in keep}
-    blocks = {(r, c): b for (r, c), b in scene.blocks.items() if r in fields and c in fields}
-    state = scene.contact_state if "contact" in fields else None
-    return replace(scene, blocks=blocks, contact_state=state, **parts)
 
 
 def test_algebraic_fixed_stress_is_exact_for_local_mechanics():
@@ -369,7 +360,7 @@ CONTRACT = {
 
 def contract_scene(name: str) -> Scene:
     """Contact mechanics, or the flow part of a coupled scene, whose fixed-stress diagonal is not zero."""
-    return load("contact") if name == "contact" else only(load("model2"), ("intf_flow", "mass"))
+    return load("contact") if name == "contact" else load("model2").only(["intf_flow", "mass"])
 
 
 def whole_vector(system: System, values: dict[str, np.ndarray]) -> PETSc.Vec:

@@ -186,12 +186,15 @@ def versions() -> dict[str, str]:
 
 
 def commit(directory: Path) -> str:
-    """Commit, or tag, of the git checkout that a directory is in; empty if it is in none."""
-    command = ["git", "-C", str(directory), "describe", "--always", "--tags", "--exact-match", "--abbrev=8"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return ""
+    """Tag or abbreviated commit of the git checkout that a directory is in; empty if it is in none."""
+    git = ["git", "-C", str(directory)]
+    for command in (["describe", "--tags", "--exact-match"], ["rev-parse", "--short=8", "HEAD"]):
+        try:
+            found = subprocess.run([*git, *command], capture_output=True, text=True, check=True, timeout=60)
+        except (OSError, subprocess.SubprocessError):
+            continue
+        return found.stdout.strip()
+    return ""
 
 
 def read(path: Path) -> Results:

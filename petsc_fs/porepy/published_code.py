@@ -126,6 +126,7 @@ def _solve_again(model: Any, options_file: str) -> tuple[int, dict[str, int], in
         scene = Adapter(model).scene()
     finally:
         model.linear_system = permuted
+    PETSc.Options().setValue(f"{PREFIX}petsc_fs_restarts", 0)  # as the published code
     with inserted(options.find_options_file(options_file), PREFIX):
         solver = Solver(scene, PETSc.COMM_SELF.tompi4py(), prefix=PREFIX)
         result = solver.solve()
