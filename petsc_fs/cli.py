@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     own, petsc = split_arguments(sys.argv[1:] if argv is None else argv)
     try:
         with contextlib.redirect_stdout(io.StringIO() if comm.rank else sys.stdout):
-            args = _parser().parse_args(own)
+            args = _parser(own[:1]).parse_args(own)
         if petsc and args.command != "solve":
             raise UsageError(f"{petsc[0]}: PETSc options go with 'solve'; options of this program have two dashes")
         return int(args.run(args, petsc, comm))
@@ -121,7 +121,7 @@ class _Parser(argparse.ArgumentParser):
         raise UsageError(f"{message}; see {self.prog} --help")
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(command: list[str]) -> argparse.ArgumentParser:
     raw = argparse.RawDescriptionHelpFormatter
     parser = _Parser(prog="petsc-fs", description=DESCRIPTION, formatter_class=raw)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -155,9 +155,10 @@ def _parser() -> argparse.ArgumentParser:
     )
 
     export = add("export", "run a PorePy model and write its linear systems as scenes", _export)
-    from petsc_fs.porepy.export import add_arguments
+    if command == ["export"]:
+        from petsc_fs.porepy.export import add_arguments
 
-    add_arguments(export)
+        add_arguments(export)
     return parser
 
 

@@ -161,8 +161,9 @@ def insert_all(values: Mapping[str, str | None], prefix: str = "") -> None:
     from petsc4py import PETSc
 
     database = PETSc.Options()
+    there = database.getAll()  # asking by hasName would count as use
     for name, value in values.items():
-        if not database.hasName(prefix + name):
+        if prefix + name not in there:
             database.setValue(prefix + name, value)
 
 
@@ -231,6 +232,7 @@ def _explain(types: Mapping[str, str]) -> set[str]:
             database.delValue("help")
             for name in types:
                 database.delValue(prefix + name)
+            sys.stdout.flush()
             ctypes.CDLL(None).fflush(None)
             os.dup2(saved, 1)
             os.close(saved)

@@ -150,7 +150,7 @@ class Solver:
         except (PETSc.Error, ImportError) as e:
             ksp.destroy()
             raise UsageError(f"PETSc refuses an option: {brief(e)}") from e
-        ksp.setConvergenceHistory()
+        ksp.setConvergenceHistory(reset=True)
         return ksp
 
     def update(self, scene: Scene) -> None:

@@ -49,6 +49,11 @@ class ContactTransform(WrapperPC):
         for needed in ("contact", "intf_force"):
             if needed not in names:
                 raise UsageError(f"ContactTransform needs a field {needed!r}; this scene has {', '.join(names)}")
+        for pair in (("intf_force", "contact"), ("contact", "intf_force")):
+            if not nest.getNestSubMatrix(names.index(pair[0]), names.index(pair[1])):
+                raise UsageError(
+                    f"ContactTransform has nothing to do: block {pair} is empty; `petsc-fs options` leaves it out"
+                )
         self.side = choice(pc, "qr_side", ("right", "left", "none"))
         blocks = {
             (r, c): nest.getNestSubMatrix(i, j)
