@@ -314,6 +314,20 @@ def test_singular_force_block_is_named_on_all_ranks(database):  # noqa: F811
         Solver(broken).solve()
 
 
+@pytest.mark.parametrize("side", ["right", "left"])
+@pytest.mark.parametrize("missing", [("contact", "intf_force"), ("intf_force", "contact")], ids="-".join)
+def test_nothing_is_transformed_where_contact_does_not_act(database, side, missing):  # noqa: F811
+    """With J_12 or J_21 zero and J_11 invertible, as with all cells open, the Jacobian stays as it is."""
+    database("contact_mechanics.opts", qr_side=side)
+    scene = load("contact")
+    blocks = {rc: b for rc, b in scene.blocks.items() if rc != missing}
+    blocks["contact", "contact"] = csr(np.eye(scene.sizes["contact"]))
+    solver = Solver(replace(scene, blocks=blocks, reference={}))
+    result = solver.solve()
+    assert result.converged
+    assert solver.ksp.getPC().getPythonContext().side == "none"
+
+
 def test_wrong_choice_names_the_option(database):  # noqa: F811
     database("contact_poromechanics.opts", qr_side="middle")
     with pytest.raises(UsageError, match=r"-qr_side middle: expected right or left"):

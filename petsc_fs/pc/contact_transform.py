@@ -49,11 +49,6 @@ class ContactTransform(WrapperPC):
         for needed in ("contact", "intf_force"):
             if needed not in names:
                 raise UsageError(f"ContactTransform needs a field {needed!r}; this scene has {', '.join(names)}")
-        for pair in (("intf_force", "contact"), ("contact", "intf_force")):
-            if not nest.getNestSubMatrix(names.index(pair[0]), names.index(pair[1])):
-                raise UsageError(
-                    f"ContactTransform has nothing to do: block {pair} is empty; `petsc-fs options` leaves it out"
-                )
         self.side = choice(pc, "qr_side", ("right", "left", "none"))
         blocks = {
             (r, c): nest.getNestSubMatrix(i, j)
@@ -61,6 +56,8 @@ class ContactTransform(WrapperPC):
             for j, c in enumerate(names)
             if nest.getNestSubMatrix(i, j)
         }
+        if not {("intf_force", "contact"), ("contact", "intf_force")} <= set(blocks):
+            self.side = "none"  # J~_11 = J_11, as with all cells open
         eliminated = self._eliminate(blocks, problem)
         self._contact, self._intf_force = nest.getNestISs()[0][:2]
         inner_members = merge_mechanics(names)
