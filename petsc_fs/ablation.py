@@ -18,6 +18,7 @@ import numpy as np
 
 from petsc_fs import hdf5, options
 from petsc_fs.fields import FIELDS
+from petsc_fs.files import write_text
 from petsc_fs.scene import CSR, Scene
 
 SCENES = Path(__file__).parent / "scenes"
@@ -51,7 +52,7 @@ def ablation(target: Path, repetitions: int, progress: Callable[[str], None]) ->
         rows.append((scene.stem, medians))
         progress(f"{scene.stem}: {medians}")
     imports = {scene.stem: _child("imports", scene, "") for scene in scenes if scene.stem in ("flow", "model2")}
-    target.write_text("\n".join(_page(rows, imports, repetitions)) + "\n", encoding="utf-8")
+    write_text(target, "\n".join(_page(rows, imports, repetitions)) + "\n")
 
 
 QUANTITIES = {

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from petsc_fs.errors import PetscFsError, SceneError, UsageError, together
 from petsc_fs.fields import in_order
+from petsc_fs.files import write_text
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -225,7 +226,7 @@ def _solve(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> i
             database=PETSc.Options().getAll(),
         )
         if everything is not None and args.report is not None:
-            _write_text(args.report, json.dumps(report, indent=2) + "\n")
+            write_text(args.report, json.dumps(report, indent=2) + "\n")
         if everything is not None and args.save is not None:
             hdf5.write_solution(everything, args.save, scene)
     if comm.rank == 0:
@@ -409,15 +410,3 @@ def find_scene(name: str) -> Path:
         names = ", ".join(sorted(p.name for p in bundled.glob("*.h5")))
         raise SceneError(f"{path}: no such file; bundled scenes are {names}")
     return path
-
-
-def _write_text(path: Path, text: str) -> None:
-    """Write a file that appears under its name only once it is complete."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(path)
-    except OSError as e:
-        raise UsageError(f"{path}: cannot be written: {e.strerror}") from e
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -16,7 +16,6 @@ cell before the next cell. What is unknown is left out.
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields as attributes
@@ -27,8 +26,9 @@ from typing import Any
 import h5py
 import numpy as np
 
-from petsc_fs.errors import LayoutError, SceneError, UsageError
+from petsc_fs.errors import LayoutError, SceneError
 from petsc_fs.fields import FIELD, FIELD_NAMES, in_order
+from petsc_fs.files import complete
 from petsc_fs.scene import CSR, Floats, Material, Metadata, Scene
 
 ENCODING = "petsc_fs scene"
@@ -57,23 +57,8 @@ def write(scene: Scene, path: str | os.PathLike[str], *, compression: str | None
 
 
 def _write_file(target: Path, fill: Callable[[h5py.File], None]) -> Path:
-    """Write a file under a temporary name and rename it once it is complete."""
-    try:
-        handle, temporary = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
-        os.close(handle)
-    except OSError as e:
-        raise UsageError(f"{target}: cannot be written: {e.strerror}") from e
-    try:
-        with h5py.File(temporary, "w") as file:
-            fill(file)
-        umask = os.umask(0)
-        os.umask(umask)
-        Path(temporary).chmod(0o666 & ~umask)
-        os.replace(temporary, target)
-    except (OSError, RuntimeError, TypeError, ValueError) as e:
-        raise UsageError(f"{target}: cannot be written: {e}") from e
-    finally:
-        Path(temporary).unlink(missing_ok=True)
+    with complete(target) as temporary, h5py.File(temporary, "w") as file:
+        fill(file)
     return target
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from petsc_fs import hdf5, options
+from petsc_fs.files import write_text
 
 SCENES = Path(__file__).parent / "scenes"
 
@@ -52,7 +53,7 @@ def survey(target: Path, ranks: Sequence[int], mpiexec: Path, progress: Callable
         lines.append(f"| {' | '.join(cells)} |")
     versions = rows[0][2][0]["versions"]
     lines += ["", f"PETSc {versions['petsc']}, petsc_fs {versions['petsc_fs']}."]
-    target.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(target, "\n".join(lines) + "\n")
 
 
 def _solve(scene: Path, file: Path, ranks: int, mpiexec: Path) -> dict[str, Any]:

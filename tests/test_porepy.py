@@ -635,7 +635,7 @@ def test_options_are_in_the_database_during_solves_only(field_split_model):
 def test_options_file_of_a_model(field_split_model, tmp_path):
     file = tmp_path / "typo.opts"
     file.write_text("-ksp_type gmres\n-ksp_rtoll 1e-3\n-pc_type none\n-ksp_max_it 5\n")
-    with pytest.raises(UsageError, match=r"typo.opts: option -ksp_rtoll was not used"):
+    with pytest.raises(UsageError, match=r"option -ksp_rtoll from typo.opts was not used; did you mean -ksp_rtol"):
         first_solve(field_split_model("flow", petsc_fs_options_file=str(file)))
     with pytest.raises(UsageError, match=r"flow.opts is for models with the fields intf_flow, mass; this one has"):
         first_solve(field_split_model("model1", petsc_fs_options_file="flow.opts"))

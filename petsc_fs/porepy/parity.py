@@ -8,7 +8,6 @@ results go into one JSON file, from which `petsc_fs.porepy.parity_page` makes a 
 from __future__ import annotations
 
 import json
-import os
 import platform
 import subprocess
 import time
@@ -20,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from petsc_fs.errors import UsageError
+from petsc_fs.files import write_text
 from petsc_fs.porepy.cases import ModelParameters
 from petsc_fs.scene import CONTACT_STATES
 
@@ -225,23 +225,7 @@ def write(results: Results, path: Path) -> None:
     for kind, runs in results.items():
         entries = [f'  "{name}": {_to_json(measured)}' for name, measured in runs.items()]
         kinds.append(f' "{kind}": {{\n' + ",\n".join(entries) + "\n }")
-    save(path, "{\n" + ",\n".join(kinds) + "\n}\n")
-
-
-def save(path: Path, text: str) -> None:
-    """Write a text file that appears under its name only once it is complete.
-
-    Raises:
-        UsageError: it cannot be written.
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(path)
-    except OSError as e:
-        raise UsageError(f"{path}: cannot be written: {e.strerror}") from e
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_text(path, "{\n" + ",\n".join(kinds) + "\n}\n")
 
 
 def _to_json(measured: Measured) -> str:

@@ -172,12 +172,7 @@ class FieldSplitSolver:
         useless = {prefix + name for name in options.parse(file)} & set(options.unused())
         if not useless:
             return
-        valid = options.known_names() - useless
-        lines = []
-        for name in sorted(useless):
-            similar = " or ".join(f"-{s}" for s in options.closest(name, valid))
-            lines.append(f"option -{name} was not used" + (f"; did you mean {similar}?" if similar else ""))
-        raise UsageError(f"{file.name}: " + "; ".join(lines))
+        raise UsageError(options.explain(sorted(useless), file=file))
 
 
 @contextmanager
