@@ -196,6 +196,7 @@ def _solve(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> i
     from petsc_fs.solver import Solver
 
     given = options.unused()
+    options.insert_all({"options_left": "no"})  # newer PETSc would repeat at its end what is said here
     layout = Layout.contiguous(comm, dimension, sizes)
     started = time.perf_counter()
     with together(comm):

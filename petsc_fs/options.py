@@ -29,6 +29,9 @@ OWN = ("petsc_fs_mat_type", "petsc_fs_restarts", "petsc_fs_true_rtol")
 SPLIT = r"(?<!pc_)fieldsplit_(?:intf_force|intf_flow|[A-Za-z]+|\d+)_"
 """The prefix of one split in an option name, but not PCFIELDSPLIT's own `pc_fieldsplit_0_fields`."""
 
+AT_THE_END = ("options_left", "options_view", "get_total_flops", "objects_view", "mpidump")
+"""Options that PETSc asks for only in PetscFinalize."""
+
 ALLOW_UNUSED = "petsc_fs_allow_unused"
 """Option with patterns, such as `my_*`, of options that may do nothing, separated by commas."""
 
@@ -255,7 +258,8 @@ def refused(names: Iterable[str]) -> list[str]:
     from petsc4py import PETSc
 
     patterns = PETSc.Options().getString(ALLOW_UNUSED, "").split(",")
-    return [n for n in names if n != ALLOW_UNUSED and not any(fnmatch.fnmatchcase(n, p) for p in patterns)]
+    passed = (ALLOW_UNUSED, *AT_THE_END)
+    return [n for n in names if n not in passed and not any(fnmatch.fnmatchcase(n, p) for p in patterns)]
 
 
 def explain(

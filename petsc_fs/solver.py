@@ -17,7 +17,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from petsc_fs.errors import SolveError, UsageError, together
+from petsc_fs.errors import PetscFsError, SolveError, UsageError, together
 from petsc_fs.layout import Layout
 from petsc_fs.scene import Scene
 from petsc_fs.system import FieldArrays, PatternChanged, System
@@ -182,12 +182,8 @@ class Solver:
         try:
             self.ksp.setUp()
             set_up_leaves(self.ksp.getPC())
-        except ImportError as e:
-            raise UsageError(f"PETSc refuses an option: {brief(e)}") from e
-        except PETSc.Error as e:
-            if e.ierr in REFUSALS:
-                raise UsageError(f"PETSc refuses an option: {brief(e)}") from e
-            raise SolveError(f"set-up failed: {brief(e)}") from e
+        except (PETSc.Error, ImportError) as e:
+            raise _ours(e, "set-up failed") from None
         self._built_seconds += time.perf_counter() - started
 
     def solve(self) -> Result:
@@ -214,8 +210,8 @@ class Solver:
         started = time.perf_counter()
         try:
             self.ksp.solve(self.system.b, self.x)
-        except PETSc.Error as e:
-            raise SolveError(f"solve failed: {brief(e)}") from e
+        except (PETSc.Error, ImportError) as e:
+            raise _ours(e, "solve failed") from None
         return self._judge(iterations + self.ksp.getIterationNumber(), seconds + time.perf_counter() - started)
 
     def _judge(self, iterations: int, solve_seconds: float) -> Result:
@@ -304,6 +300,21 @@ def needed_data(prefix: str) -> dict[str, bool]:
         "near_null_space": nodal or foreign or bool(types & {"gamg", "ml", "bddc", "hmg"}),
         "fixed_stress": foreign or own[1] in chosen.values(),
     }
+
+
+def _ours(error: Exception, what: str) -> PetscFsError:
+    """The error of this package that stands for one of PETSc's.
+
+    An exception in a Python PC comes through PETSc as it is, or, in newer petsc4py, as the cause of its error.
+    """
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, PetscFsError):
+            return cause
+        if isinstance(cause, ImportError) or (isinstance(cause, PETSc.Error) and cause.ierr in REFUSALS):
+            return UsageError(f"PETSc refuses an option: {brief(cause)}")
+        cause = cause.__cause__ or cause.__context__
+    return SolveError(f"{what}: {brief(error)}")
 
 
 def reason_name(ksp: PETSc.KSP) -> str:
