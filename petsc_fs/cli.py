@@ -224,7 +224,7 @@ def _solve(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> i
             options_file=options_file,
             tree=tree,
             read_seconds=read_seconds,
-            database=PETSc.Options().getAll(),
+            database={k: v for k, v in PETSc.Options().getAll().items() if k != "options_left"},
         )
         if everything is not None and args.report is not None:
             write_text(args.report, json.dumps(report, indent=2) + "\n")
