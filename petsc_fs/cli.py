@@ -11,6 +11,7 @@ import sys
 import time
 import traceback
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -27,6 +28,16 @@ if TYPE_CHECKING:
 
 CANONICAL = "contact_poromechanics.opts"
 """Options file with all levels, from which `solve` and `options` cut the smallest tree for a scene."""
+
+TAKES_PETSC = ("solve",)
+"""Commands that pass PETSc's options on."""
+
+MODULES = {
+    "export": ("run a PorePy model and write its linear systems as scenes", "petsc_fs.porepy.export"),
+}
+"""Commands with a module of their own: summary, and the module. It has `add_arguments(parser)`, which describes the
+arguments, and `command(args, petsc, comm)`, which runs and returns the exit code, collectively on all ranks; it is
+imported only where its command is called."""
 
 SECONDS_TO_AGREE = 5.0
 """How long ranks wait for each other after an error before they take the others for stuck."""
@@ -63,8 +74,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with contextlib.redirect_stdout(io.StringIO() if comm.rank else sys.stdout):
             args = _parser(own[:1]).parse_args(own)
-        if petsc and args.command != "solve":
-            raise UsageError(f"{petsc[0]}: PETSc options go with 'solve'; options of this program have two dashes")
+        if petsc and args.command not in TAKES_PETSC:
+            raise UsageError(
+                f"{petsc[0]}: PETSc options go with {' and '.join(TAKES_PETSC)}; options of petsc-fs have two dashes"
+            )
         return int(args.run(args, petsc, comm))
     except SystemExit as e:  # --help
         return int(e.code or 0)
@@ -155,11 +168,12 @@ def _parser(command: list[str]) -> argparse.ArgumentParser:
         "--dimension", type=int, choices=(2, 3), help="of the rock, where SOURCE is a folder without scene.h5"
     )
 
-    export = add("export", "run a PorePy model and write its linear systems as scenes", _export)
-    if command == ["export"]:
-        from petsc_fs.porepy.export import add_arguments
-
-        add_arguments(export)
+    for name, (summary, module) in MODULES.items():
+        sub = add(name, summary, None)
+        if command == [name]:
+            own = import_module(module)
+            own.add_arguments(sub)
+            sub.set_defaults(run=own.command)
     return parser
 
 
@@ -385,15 +399,6 @@ def _convert(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) ->
     else:
         written = petsc_binary.from_scene(find_scene(args.source), target)
     print(f"written: {', '.join(str(p) for p in written)}")
-    return 0
-
-
-def _export(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
-    if comm.size > 1:
-        raise UsageError("export runs on one rank, as PorePy does; start it without mpiexec")
-    from petsc_fs.porepy.export import run
-
-    run(args)
     return 0
 
 

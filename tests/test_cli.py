@@ -134,7 +134,7 @@ FAILURES = {
     ),
     "wrong_subcommand": (2, ["slove", "flow.h5"], ["invalid choice: 'slove' (choose from 'solve', "]),
     "no_scene": (2, ["solve"], ["the following arguments are required: SCENE"]),
-    "petsc_option_elsewhere": (2, ["inspect", "flow.h5", "-ksp_view"], ["-ksp_view: PETSc options go with 'solve'"]),
+    "petsc_option_elsewhere": (2, ["inspect", "flow.h5", "-ksp_view"], ["-ksp_view: PETSc options go with solve"]),
     "report_into_missing_folder": (
         2,
         ["solve", "flow.h5", "--report", "nowhere/report.json"],

@@ -23,6 +23,8 @@ from petsc_fs.porepy.cases import CASES, FRACTURE_PERMEABILITY, PHYSICS, ModelPa
 from petsc_fs.scene import CONTACT_STATES, Scene, contact_state_counts
 
 if TYPE_CHECKING:
+    from mpi4py import MPI
+
     from petsc_fs.porepy.adapter import Adapter
 
 Floats = NDArray[np.float64]
@@ -231,7 +233,7 @@ def export_bundled(
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Describe the arguments of `run`; needs no PorePy."""
+    """Describe the arguments of `command`; needs no PorePy."""
     parser.add_argument("model", choices=list(CASES), help="name of the model")
     parser.add_argument(
         "--refine", dest="refinement", type=float, default=1.0, metavar="G", help="cells are 100 m / G wide"
@@ -263,12 +265,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--reference", action="store_true", help="store an accurate solution too")
 
 
-def run(args: argparse.Namespace, progress: Progress | None = None) -> None:
-    """Export what the arguments of `add_arguments` ask for; progress goes to stderr by default.
+def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
+    """Export what the arguments of `add_arguments` ask for; progress goes to stderr.
 
     Raises:
         PetscFsError: see `export`.
     """
+    if comm.size > 1:
+        raise UsageError("export runs on one rank, as PorePy does; start it without mpiexec")
     parameters = ModelParameters(
         refinement=args.refinement,
         friction=args.friction,
@@ -283,8 +287,9 @@ def run(args: argparse.Namespace, progress: Progress | None = None) -> None:
         steps=args.steps,
         parameters=parameters,
         reference=args.reference,
-        progress=progress if progress is not None else write_to_stderr,
+        progress=write_to_stderr,
     )
+    return 0
 
 
 def write_to_stderr(line: str) -> None:
