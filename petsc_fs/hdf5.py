@@ -50,10 +50,19 @@ def write(scene: Scene, path: str | os.PathLike[str], *, compression: str | None
     """
     target = Path(path)
     scene.validate()
-    if scene.rows is not None and any(scene.row_range(f) != (0, n) for f, n in scene.sizes.items()):
+    if scene.cells or any(scene.row_range(f) != (0, n) for f, n in scene.sizes.items()):
         raise SceneError(f"{target}: only a whole scene can be written, this is the part of one rank")
+    return _write_file(target, lambda file: write_group(file, scene, dataset_creator(compression)))
+
+
+def dataset_creator(compression: str | None) -> Callable[[h5py.Group, str, Any], object]:
+    """What stores an array under a name in a group, compressed if it has any entries."""
     options = {"compression": compression, "shuffle": True} if compression else {}
-    return _write_file(target, lambda file: _write(file, scene, options))
+
+    def create(group: h5py.Group, name: str, array: Any) -> object:
+        return group.create_dataset(name, data=array, **(options if array.size else {}))
+
+    return create
 
 
 def _write_file(target: Path, fill: Callable[[h5py.File], None]) -> Path:
@@ -86,12 +95,20 @@ def write_solution(solution: Mapping[str, Any], path: str | os.PathLike[str], sc
     return _write_file(Path(path), fill)
 
 
-def _write(file: h5py.File, scene: Scene, options: dict[str, Any]) -> None:
+def write_group(file: h5py.Group, scene: Scene, create: Callable[[h5py.Group, str, Any], object]) -> None:
+    """Write a whole scene into an empty file or group.
+
+    Args:
+        file: to write into.
+        scene: with all rows, valid.
+        create: given a group, a name and an array, stores it.
+    """
+
     def put(group: h5py.Group, name: str, values: Any) -> None:
         array = np.asarray(values)
         if array.dtype.kind == "i" and name in ("indices", "indptr"):
             array = array.astype(np.int32 if (array.size == 0 or array.max() < 2**31) else np.int64)
-        group.create_dataset(name, data=array, **(options if array.size else {}))
+        create(group, name, array)
 
     meta = scene.metadata
     file.attrs["encoding-type"] = ENCODING
@@ -155,8 +172,8 @@ def read_sizes(path: str | os.PathLike[str]) -> tuple[int, dict[str, int]]:
     Raises:
         SceneError: the file is not a scene of this version.
     """
-    with _open(Path(path)) as file:
-        return _header(file)
+    with open_file(Path(path)) as file:
+        return read_header(file)
 
 
 def read(
@@ -175,18 +192,25 @@ def read(
         SceneError: the file is missing, no HDF5, cut short, not a scene, or of another version.
         LayoutError: its parts do not fit together.
     """
-    with _open(Path(path)) as file:
-        dimension, sizes = _header(file)
-        ranges = {f: (0, n) for f, n in sizes.items()} if rows is None else dict(rows(dimension, sizes))
-        scene = _read(file, dimension, sizes, ranges)
-        if rows is not None:
-            scene.rows = ranges
-        scene.validate()
+    with open_file(Path(path)) as file:
+        return read_group(file, rows)
+
+
+def read_group(
+    group: h5py.Group, rows: Callable[[int, dict[str, int]], Mapping[str, tuple[int, int]]] | None = None
+) -> Scene:
+    """Read a scene, or the rows of one rank, from an open file or a group of one; see `read`."""
+    dimension, sizes = read_header(group)
+    ranges = {f: (0, n) for f, n in sizes.items()} if rows is None else dict(rows(dimension, sizes))
+    scene = _read(group, dimension, sizes, ranges)
+    if rows is not None:
+        scene.rows = ranges
+    scene.validate()
     return scene
 
 
 @contextmanager
-def _open(path: Path) -> Iterator[h5py.File]:
+def open_file(path: Path) -> Iterator[h5py.File]:
     """The file, with every way in which it can be unreadable told apart."""
     if not path.exists():
         raise SceneError(f"{path}: no such file")
@@ -200,19 +224,33 @@ def _open(path: Path) -> Iterator[h5py.File]:
         if "truncated" in str(e):
             raise SceneError(f"{path}: the file is truncated; copy or export it again") from e
         raise SceneError(f"{path}: not an HDF5 file, so not a scene; make one with petsc-fs export") from e
-    with file:
-        try:
-            yield file
-        except SceneError as e:
-            raise type(e)(f"{path}: {e}") from e
-        except KeyError as e:
-            raise SceneError(f"{path}: the scene is incomplete: {e.args[0]}") from e
-        except (OSError, RuntimeError, TypeError, ValueError, AttributeError, IndexError) as e:
-            raise SceneError(f"{path}: the scene is damaged ({e}); copy or export it again") from e
+    with file, explained(path):
+        yield file
 
 
-def _header(file: h5py.File) -> tuple[int, dict[str, int]]:
+@contextmanager
+def explained(path: Path) -> Iterator[None]:
+    """What goes wrong in reading, as an error that names the file."""
+    try:
+        yield
+    except SceneError as e:
+        raise type(e)(f"{path}: {e}") from e
+    except KeyError as e:
+        raise SceneError(f"{path}: the scene is incomplete: {e.args[0]}") from e
+    except (OSError, RuntimeError, TypeError, ValueError, AttributeError, IndexError) as e:
+        raise SceneError(f"{path}: the scene is damaged ({e}); copy or export it again") from e
+
+
+def read_header(file: h5py.File) -> tuple[int, dict[str, int]]:
+    """Dimension of a scene, and size of each field.
+
+    Raises:
+        SceneError: the file is not a scene of this version.
+        LayoutError: a size is impossible.
+    """
     found, number = file.attrs.get("encoding-type"), file.attrs.get("encoding-version")
+    if found == "petsc_fs sequence":
+        raise SceneError("a sequence of scenes, and one is needed; petsc-fs convert --step K takes one out of it")
     if found != ENCODING:
         what = f"its encoding-type is {found!r}" if found is not None else "it has no encoding-type"
         raise SceneError(f"an HDF5 file, but not a petsc_fs scene: {what}, expected {ENCODING!r}")
@@ -257,7 +295,7 @@ def _read(file: h5py.File, dimension: int, sizes: dict[str, int], rows: Mapping[
                 raise LayoutError(f"{name}: {what} has {len(group[what])} entries, expected {expected}")
             a, b = rows[name]
             values = group[what][a // bs : b // bs] if per_cell else group[what][a:b]
-            store[name] = values if what in ("cell_dimension", "contact_state") else _real(values)
+            store[name] = values if what in ("cell_dimension", "contact_state") else real_numbers(values)
     blocks: dict[tuple[str, str], CSR] = {}
     for r, row in file["blocks"].items():
         for c in row:
@@ -276,18 +314,38 @@ def _read(file: h5py.File, dimension: int, sizes: dict[str, int], rows: Mapping[
         cell_dimension=found["cell_dimension"].get("mass"),
         contact_state=found["contact_state"].get("contact"),
         material=_read_material(file, sizes["mass"], rows["mass"]) if "material" in file and "mass" in sizes else None,
-        metadata=Metadata(
-            model=str(file.attrs["model"]),
-            time_step_index=int(file.attrs["time_step_index"]),
-            newton_index=int(file.attrs["newton_index"]),
-            time=float(file.attrs["time"]),
-            units={k: float(v) for k, v in file["units"].attrs.items()},
-            producers={k: str(v) for k, v in file["producers"].attrs.items()},
-        ),
+        metadata=read_metadata(file),
+    )
+
+
+def read_metadata(file: h5py.File) -> Metadata:
+    """Where a scene comes from."""
+    return Metadata(
+        model=str(file.attrs["model"]),
+        time_step_index=int(file.attrs["time_step_index"]),
+        newton_index=int(file.attrs["newton_index"]),
+        time=float(file.attrs["time"]),
+        units={k: float(v) for k, v in file["units"].attrs.items()},
+        producers={k: str(v) for k, v in file["producers"].attrs.items()},
     )
 
 
 def _read_block(group: h5py.Group, what: str, shape: tuple[int, int], start: int, stop: int) -> CSR:
+    check_block(group, what, shape)
+    pointers, columns, values = (group[name] for name in CSR._fields)
+    indptr = pointers[start : stop + 1].astype(np.int64)
+    a, b = int(indptr[0]), int(indptr[-1])
+    if start == 0 and a != 0:
+        raise LayoutError(f"{what}: indptr starts at {a}, expected 0")
+    if not 0 <= a <= b <= values.size:
+        raise LayoutError(f"{what}: indptr runs to {b}, but there are {values.size} values")
+    if stop == shape[0] and b != values.size:
+        raise LayoutError(f"{what}: indptr ends at {b}, but there are {values.size} values")
+    return CSR(indptr - a, columns[a:b], real_numbers(values[a:b]))
+
+
+def check_block(group: h5py.Group, what: str, shape: tuple[int, int]) -> None:
+    """The shapes and kinds of the datasets of a block."""
     encoding = group.attrs["encoding-type"]
     if encoding != "csr_matrix":
         raise LayoutError(f"{what}: encoding-type is {encoding!r}, expected 'csr_matrix'")
@@ -300,18 +358,9 @@ def _read_block(group: h5py.Group, what: str, shape: tuple[int, int], start: int
         raise LayoutError(f"{what}: indptr has {pointers.size} entries, expected {shape[0] + 1}")
     if columns.shape != values.shape:
         raise LayoutError(f"{what}: {columns.size} indices but {values.size} values")
-    indptr = pointers[start : stop + 1].astype(np.int64)
-    a, b = int(indptr[0]), int(indptr[-1])
-    if start == 0 and a != 0:
-        raise LayoutError(f"{what}: indptr starts at {a}, expected 0")
-    if not 0 <= a <= b <= values.size:
-        raise LayoutError(f"{what}: indptr runs to {b}, but there are {values.size} values")
-    if stop == shape[0] and b != values.size:
-        raise LayoutError(f"{what}: indptr ends at {b}, but there are {values.size} values")
-    return CSR(indptr - a, columns[a:b], _real(values[a:b]))
 
 
-def _real(values: Any) -> Floats:
+def real_numbers(values: Any) -> Floats:
     """Numbers as they are computed with; a TypeError for text and complex numbers."""
     return np.asarray(values).astype(np.float64, casting="same_kind", copy=False)
 
@@ -322,5 +371,5 @@ def _read_material(file: h5py.File, size: int, rows: tuple[int, int]) -> Materia
     for name in group:
         if group[name].shape != (size,):
             raise LayoutError(f"material: {name} has shape {group[name].shape}, expected {(size,)}")
-    values = {n: _real(group[n][slice(*rows)]) if n in group else float(group.attrs[n]) for n in names}
+    values = {n: real_numbers(group[n][slice(*rows)]) if n in group else float(group.attrs[n]) for n in names}
     return Material(**values, time_step=float(group.attrs["time_step"]))

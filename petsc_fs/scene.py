@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from petsc_fs.errors import LayoutError, SceneError
 from petsc_fs.fields import FIELD, FIELD_NAMES, in_order
+from petsc_fs.layout import rows_of
+
+if TYPE_CHECKING:
+    from petsc_fs.layout import Layout
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.integer[Any]]
 
 ALMOST_SINGULAR = 1e-14
 """Ratio of least to greatest singular value at which a small matrix counts as singular."""
+
+SLAB = 1 << 20
+"""Number of entries that are sorted or renumbered at a time, which bounds the memory it takes."""
 
 CONTACT_STATES = ("sticking", "sliding", "open")
 """Names of the values 0, 1, 2 of `Scene.contact_state`."""
@@ -87,7 +94,8 @@ class Scene:
     """A Jacobian in blocks, its right-hand side, and what is known about them.
 
     A scene holds all rows, or, where `rows` says so, those of one rank; then the arrays per row
-    and per cell cover these rows only, while `sizes` and column numbers stay global.
+    and per cell cover these rows only, while `sizes` and column numbers stay global. The part of one
+    rank is numbered, rows and columns, as the `petsc_fs.layout.Layout` that it was made for.
 
     Attributes:
         dimension: of the rock matrix, D = 2 or 3.
@@ -102,6 +110,8 @@ class Scene:
         material: data of the fixed-stress diagonals, None if unknown.
         metadata: where the scene comes from.
         rows: per field the half-open range of rows held here; None if all.
+        cells: per field the numbers in the whole scene of the cells held here; missing where they are
+            the `rows`. Errors name rows and cells by these.
     """
 
     dimension: int
@@ -116,6 +126,7 @@ class Scene:
     material: Material | None = None
     metadata: Metadata = field(default_factory=Metadata)
     rows: dict[str, tuple[int, int]] | None = None
+    cells: dict[str, Integers] = field(default_factory=dict)
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -129,6 +140,13 @@ class Scene:
     def row_range(self, name: str) -> tuple[int, int]:
         """Half-open global range of the rows of a field that are held here."""
         return self.rows[name] if self.rows is not None else (0, self.sizes[name])
+
+    def row_name(self, name: str, row: int) -> int:
+        """Number in the whole scene of a row of a field, given its place among those held here."""
+        bs = self.block_size(name)
+        if name in self.cells:
+            return int(self.cells[name][row // bs]) * bs + row % bs
+        return self.row_range(name)[0] + row
 
     @classmethod
     def from_matrix(
@@ -183,17 +201,11 @@ class Scene:
 
         indptr = np.asarray(matrix.indptr, dtype=np.int64)
         blocks: dict[tuple[str, str], CSR] = {}
+        whole = CSR(indptr, np.asarray(matrix.indices), np.asarray(matrix.data))
         for r in names:
-            take, counts = gather_rows(indptr, row_ids[r])
-            cols = np.asarray(matrix.indices)[take]
-            data = np.asarray(matrix.data, dtype=np.float64)[take]
-            row_of = np.repeat(np.arange(row_ids[r].size), counts)
-            owners = owner[cols]
-            for k, c in enumerate(names):
-                mine = owners == k
-                if not mine.any():
-                    continue
-                blocks[r, c] = _sorted_rows(row_of[mine], local[cols[mine]], data[mine], row_ids[r].size)
+            for c, block in zip(names, _cut_rows(whole, row_ids[r], owner, local, len(names)), strict=True):
+                if block.data.size:
+                    blocks[r, c] = block
         scene = cls(
             dimension=dimension,
             sizes={f: row_ids[f].size for f in names},
@@ -273,15 +285,14 @@ class Scene:
             )
         if block.indices.size and not (0 <= block.indices.min() and block.indices.max() < self.sizes[c]):
             raise LayoutError(f"block ({r}, {c}): a column number is outside 0:{self.sizes[c]}")
-        if block.indices.size > 1:
-            falls = block.indices[1:] <= block.indices[:-1]
-            falls[block.indptr[1:-1][(block.indptr[1:-1] > 0) & (block.indptr[1:-1] < block.indices.size)] - 1] = False
-            if falls.any():
-                raise LayoutError(f"block ({r}, {c}): columns of a row must increase, without duplicates")
+        if not increasing(block):
+            raise LayoutError(f"block ({r}, {c}): columns of a row must increase, without duplicates")
         if not np.isfinite(block.data).all():
             at = np.flatnonzero(~np.isfinite(block.data))[0]
-            row = start + int(np.searchsorted(block.indptr, at, side="right")) - 1
-            raise SceneError(f"block ({r}, {c}): row {row} has an entry that is not finite (NaN or Inf)")
+            row = int(np.searchsorted(block.indptr, at, side="right")) - 1
+            raise SceneError(
+                f"block ({r}, {c}): row {self.row_name(r, row)} has an entry that is not finite (NaN or Inf)"
+            )
 
     def _check_cell_data(self) -> None:
         if self.contact_state is not None:
@@ -327,49 +338,120 @@ class Scene:
             contact_state=self.contact_state if "contact" in names else None,
             material=self.material if "mass" in names else None,
             rows=None if self.rows is None else part(self.rows),
+            cells=part(self.cells),
         )
 
-    def restrict(self, rows: Mapping[str, tuple[int, int]]) -> Scene:
-        """The part of a whole scene that one rank holds.
+    def restrict(self, where: Layout | Mapping[str, tuple[int, int]]) -> Scene:
+        """The part of a whole scene that one rank holds, numbered as the layout.
+
+        Local: does not communicate.
 
         Args:
-            rows: per field a half-open range of global rows, whole cells.
+            where: a layout, for its part on this rank; or per field a half-open range of rows, whole cells.
 
         Raises:
-            LayoutError: a range is missing, outside the scene or cuts through a cell.
+            LayoutError: the scene is a part already, or `where` lacks a field, is for another size or cuts
+                through a cell.
         """
         if self.rows is not None:
             raise LayoutError("restrict: the scene is already the part of one rank")
+        own, places = {}, {}
+        rows = dict(where) if isinstance(where, Mapping) else {f: where.rows(f) for f in where.fields}
         for name, size in self.sizes.items():
             if name not in rows or not 0 <= rows[name][0] <= rows[name][1] <= size:
                 raise LayoutError(f"{name}: row range {rows.get(name)} is not inside 0:{size}")
+            if isinstance(where, Mapping):
+                own[name] = np.arange(*(n // self.block_size(name) for n in rows[name]))
+                continue
+            if where.sizes(name)[1] != size:
+                raise LayoutError(f"{name}: {size} rows in the scene, {where.sizes(name)[1]} in the layout")
+            own[name] = where.own_cells(name)
+            if name in where.cells:
+                places[name] = where.places(name)
+        own_rows = {f: rows_of(cells, self.block_size(f)) for f, cells in own.items()}
 
-        def cells(name: str) -> slice:
-            bs = self.block_size(name)
-            return slice(rows[name][0] // bs, rows[name][1] // bs)
+        def of_cells(values: Any, name: str) -> Any:
+            return values[own[name]] if values is not None and name in own else None
 
         material = self.material if "mass" in self.sizes else None
         if material is not None:
-            cut = {k: v if np.ndim(v) == 0 else np.asarray(v)[cells("mass")] for k, v in material.cell_data().items()}
+            cut = {k: v if np.ndim(v) == 0 else np.asarray(v)[own["mass"]] for k, v in material.cell_data().items()}
             material = Material(**cut, time_step=material.time_step)
         part = Scene(
             dimension=self.dimension,
             sizes=dict(self.sizes),
-            blocks={(r, c): csr_rows(b, *rows[r]) for (r, c), b in self.blocks.items()},
-            rhs={f: v[slice(*rows[f])] for f, v in self.rhs.items()},
-            reference={f: v[slice(*rows[f])] for f, v in self.reference.items()},
-            cell_centers={f: v[cells(f)] for f, v in self.cell_centers.items()},
-            cell_volumes={f: v[cells(f)] for f, v in self.cell_volumes.items()},
-            cell_dimension=None
-            if self.cell_dimension is None or "mass" not in rows
-            else self.cell_dimension[cells("mass")],
-            contact_state=None if self.contact_state is None else self.contact_state[cells("contact")],
+            blocks={
+                (r, c): _renumbered(_take_rows(b, own_rows[r]), places.get(c), self.block_size(c))
+                for (r, c), b in self.blocks.items()
+            },
+            rhs={f: v[own_rows[f]] for f, v in self.rhs.items()},
+            reference={f: v[own_rows[f]] for f, v in self.reference.items()},
+            cell_centers={f: v[own[f]] for f, v in self.cell_centers.items()},
+            cell_volumes={f: v[own[f]] for f, v in self.cell_volumes.items()},
+            cell_dimension=of_cells(self.cell_dimension, "mass"),
+            contact_state=of_cells(self.contact_state, "contact"),
             material=material,
             metadata=self.metadata,
             rows={f: (int(a), int(b)) for f, (a, b) in rows.items()},
+            cells={f: own[f] for f in places},
         )
         part.validate()
         return part
+
+
+def _take_rows(block: CSR, rows: Integers) -> CSR:
+    """Some rows of a block, in the order given; without a copy if they follow each other."""
+    if not rows.size or (np.diff(rows) == 1).all():
+        return csr_rows(block, int(rows[0]), int(rows[-1]) + 1) if rows.size else csr_rows(block, 0, 0)
+    take, counts = gather_rows(block.indptr, rows)
+    return CSR(np.concatenate([[0], np.cumsum(counts)]), block.indices[take], block.data[take])
+
+
+def _renumbered(block: CSR, places: Integers | None, block_size: int) -> CSR:
+    """A block with other column numbers, see `renumber`; the same block where there are none."""
+    if places is None:
+        return block
+    out = CSR(block.indptr, np.empty_like(block.indices), np.empty_like(block.data))
+    renumber(block, places, block_size, out)
+    return out
+
+
+def increasing(block: CSR) -> bool:
+    """Whether the columns of each row increase, without duplicates."""
+    for a, b, start, stop in slabs(block.indptr, SLAB):
+        columns = block.indices[start:stop]
+        falls = columns[1:] <= columns[:-1]
+        ends = block.indptr[a + 1 : b] - start  # rows may begin anywhere
+        falls[ends[(ends > 0) & (ends < columns.size)] - 1] = False
+        if falls.any():
+            return False
+    return True
+
+
+def renumber(block: CSR, places: Integers, block_size: int, out: CSR) -> None:
+    """Give columns other numbers and sort them again.
+
+    Args:
+        block: rows of a block.
+        places: (cells of the columns,) the new number of each cell.
+        block_size: unknowns per cell of the columns.
+        out: of the same rows; may be `block` itself.
+    """
+    for a, b, start, stop in slabs(block.indptr, SLAB):
+        columns = block.indices[start:stop].astype(np.int64)
+        columns = places[columns // block_size] * block_size + columns % block_size
+        rows = np.repeat(np.arange(b - a), np.diff(block.indptr[a : b + 1]))
+        order = np.argsort(rows * (places.size * block_size) + columns, kind="stable")
+        out.indices[start:stop], out.data[start:stop] = columns[order], block.data[start:stop][order]
+
+
+def slabs(indptr: Integers, entries: int) -> Iterator[tuple[int, int, int, int]]:
+    """Groups of whole rows with about so many entries each: first and last row, first and last entry (half-open)."""
+    a, n = 0, indptr.size - 1
+    while a < n:
+        b = max(a + 1, int(np.searchsorted(indptr, int(indptr[a]) + entries, side="right")) - 1)
+        yield a, b, int(indptr[a]), int(indptr[b])
+        a = b
 
 
 def csr_rows(block: CSR, start: int, stop: int) -> CSR:
@@ -422,7 +504,7 @@ def _inverse(ids: Mapping[str, Integers], n: int, what: str) -> tuple[Integers, 
         LayoutError: an index is outside 0:n, or in no field, or in two.
     """
     owner = np.full(n, -1, dtype=np.int8)
-    local = np.zeros(n, dtype=np.int64)
+    local: Integers = np.zeros(n, dtype=np.int32 if n < 2**31 else np.int64)
     for k, (name, index) in enumerate(ids.items()):
         if index.size and not (0 <= index.min() and index.max() < n):
             raise LayoutError(f"{name}: a {what} number is outside 0:{n}")
@@ -448,6 +530,40 @@ def _sorted_rows(rows: Integers, cols: Integers, data: Floats, n: int) -> CSR:
     order = np.lexsort((cols, rows))
     indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))])
     return CSR(indptr, cols[order], data[order])
+
+
+def _cut_rows(matrix: CSR, rows: Integers, owner: Integers, local: Integers, parts: int) -> list[CSR]:
+    """Some rows of a matrix, cut by the owners of their columns, which are renumbered and sorted."""
+    blocks: list[list[CSR]] = [[] for _ in range(parts)]
+    for piece in _pieces(matrix.indptr, rows):
+        take, counts = gather_rows(matrix.indptr, piece)
+        cols, data = matrix.indices[take], matrix.data[take].astype(np.float64, copy=False)
+        row_of = np.repeat(np.arange(piece.size), counts)
+        owners = owner[cols]
+        for k, block in enumerate(blocks):
+            mine = owners == k
+            block.append(_sorted_rows(row_of[mine], local[cols[mine]], data[mine], piece.size))
+    return [_stack(block) for block in blocks]
+
+
+def _pieces(indptr: Integers, rows: Integers) -> list[Integers]:
+    """Rows in their order, cut where about `SLAB` entries are full."""
+    full = np.cumsum(indptr[rows + 1] - indptr[rows]) // SLAB
+    return list(np.split(rows, np.flatnonzero(np.diff(full)) + 1))
+
+
+def _stack(parts: list[CSR]) -> CSR:
+    """Blocks below each other as one; the list is emptied on the way, so that little is held twice."""
+    if len(parts) == 1:
+        return parts[0]
+    ends = np.cumsum([part.data.size for part in parts])
+    indptr = np.concatenate([parts[0].indptr, *(p.indptr[1:] + e for p, e in zip(parts[1:], ends, strict=False))])
+    indices, data = np.empty(ends[-1], dtype=parts[0].indices.dtype), np.empty(ends[-1])
+    for end in ends[::-1]:
+        part = parts.pop()
+        indices[end - part.data.size : end] = part.indices
+        data[end - part.data.size : end] = part.data
+    return CSR(indptr, indices, data)
 
 
 def contact_state_counts(states: Iterable[int]) -> dict[str, int]:
