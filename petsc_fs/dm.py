@@ -112,17 +112,18 @@ def merge_mechanics(names: Sequence[str]) -> Members:
     return merged
 
 
-def field_nest(members: Members, blocks: Blocks, layout: Layout) -> PETSc.Mat:
-    """One MatNest over fields, those made of several assembled into one AIJ on the diagonal.
+def field_nest(members: Members, blocks: Blocks, layout: Layout, mat_type: str = "aij") -> PETSc.Mat:
+    """One MatNest over fields, those made of several assembled into one matrix on the diagonal.
 
     Collective. Assembling copies; all other blocks are there by reference, in a MatNest of their own
-    where a row or column has several fields. The AIJ keeps the block size that its fields share, which
-    multigrid needs.
+    where a row or column has several fields. The assembled matrix keeps the block size that its fields
+    share, which multigrid needs.
 
     Args:
         members: fields by name, as in `field_dm`.
         blocks: matrices by pairs of fields of the table.
         layout: distribution of rows.
+        mat_type: of assembled matrices, see `one_matrix`.
     """
 
     def block(rows: tuple[str, ...], columns: tuple[str, ...]) -> PETSc.Mat | None:
@@ -130,25 +131,34 @@ def field_nest(members: Members, blocks: Blocks, layout: Layout) -> PETSc.Mat:
             return blocks.get((rows[0], columns[0]))
         if not any((r, c) in blocks for r in rows for c in columns):
             return None
-        return one_matrix(rows, blocks, layout) if rows == columns else _nest(rows, columns, blocks, layout)
+        if rows != columns:
+            return _nest(rows, columns, blocks, layout)
+        return one_matrix(rows, blocks, layout, mat_type=mat_type)
 
     return PETSc.Mat().createNest([[block(r, c) for _, c in members] for _, r in members], comm=layout.comm)
 
 
-def one_matrix(fields: Sequence[str], blocks: Blocks, layout: Layout, out: PETSc.Mat | None = None) -> PETSc.Mat:
-    """The square matrix of some fields as one AIJ with the block size they share. Collective.
+def one_matrix(
+    fields: Sequence[str], blocks: Blocks, layout: Layout, out: PETSc.Mat | None = None, mat_type: str = "aij"
+) -> PETSc.Mat:
+    """The square matrix of some fields as one matrix with the block size they share. Collective.
 
     Args:
         fields: of the rows and columns, in the order of the table.
         blocks: matrices by pairs of fields, copied.
         layout: distribution of rows.
         out: an earlier result of the same pattern, to take the new values.
+        mat_type: "aij", or "hypre" for the storage that PCHYPRE works on, of which it then needs no copy.
+            One field alone is passed on by reference, as AIJ.
     """
     if len(fields) == 1:
         return blocks[fields[0], fields[0]]
     nest = _nest(fields, fields, blocks, layout)
     matrix = nest.convert("aij", PETSc.Mat() if out is None else out)
     nest.destroy()
+    if mat_type != "aij":
+        aij, matrix = matrix, matrix.convert(mat_type, PETSc.Mat())
+        aij.destroy()
     if out is None:
         size = common_block_size(layout, fields)
         matrix.setBlockSizes(size, size)

@@ -13,7 +13,7 @@ from petsc_fs.dm import Blocks, Problem, field_dm, field_nest, merge_mechanics, 
 from petsc_fs.errors import LayoutError, SceneError, together
 from petsc_fs.fixed_stress import analytic_coefficients
 from petsc_fs.layout import Layout
-from petsc_fs.scene import CSR, Scene
+from petsc_fs.scene import CSR, SLAB, Integers, Scene, slabs
 
 FieldArrays = dict[str, NDArray[np.float64]]
 
@@ -43,6 +43,7 @@ class System:
         mat_type: str = "nest",
         near_null_space: bool = True,
         fixed_stress: bool = True,
+        release: bool = False,
     ) -> None:
         """Build everything from the rows of this rank.
 
@@ -55,6 +56,7 @@ class System:
                 matrix; "aij" for a copy of everything in one matrix, as direct solvers need it.
             near_null_space: whether displacement fields get their rigid-body modes.
             fixed_stress: whether the fixed-stress coefficients are computed.
+            release: take each block out of the scene as soon as PETSc has it, so that little is held twice.
 
         Raises:
             LayoutError: scene and layout differ.
@@ -70,11 +72,12 @@ class System:
         pairs = list(product(fields, fields))
         entries = np.array([scene.blocks[rc].data.size if rc in scene.blocks else 0 for rc in pairs])
         entries = layout.comm.allreduce(entries)
-        self.blocks: Blocks = {
-            rc: self._create_block(*rc, scene.blocks.get(rc))
-            for rc, n in zip(pairs, entries, strict=True)
-            if n or rc[0] == rc[1]
-        }
+        self.blocks: Blocks = {}
+        for rc, n in zip(pairs, entries, strict=True):
+            block = scene.blocks.pop(rc, None) if release else scene.blocks.get(rc)
+            if n or rc[0] == rc[1]:
+                self.blocks[rc] = self._create_block(*rc, block)
+            del block  # before the next one is made
         self.members = merge_mechanics(fields) if mat_type == "merged" else [(f, (f,)) for f in fields]
         if mat_type == "aij" or len(self.members) == 1:
             self.J = one_matrix(fields, self.blocks, layout)
@@ -139,8 +142,9 @@ class System:
         whole = {f: np.abs(np.concatenate(self.layout.comm.allgather(v))) for f, v in solution.items()}
         for (r, c), block in self.blocks.items():
             indptr, indices, values = block.getValuesCSR()
-            sums = np.concatenate([[0.0], np.cumsum(np.abs(values) * whole[c][indices])])
-            magnitude[r] += np.diff(sums[indptr])
+            for first, last, start, stop in slabs(indptr, SLAB):
+                sums = np.concatenate([[0.0], np.cumsum(np.abs(values[start:stop]) * whole[c][indices[start:stop]])])
+                magnitude[r][first:last] += np.diff(sums[indptr[first : last + 1] - start])
         norms = self.field_norms(magnitude)
         return float(np.finfo(np.float64).eps * np.linalg.norm(list(norms.values())))
 
@@ -149,7 +153,7 @@ class System:
         parts = self.layout.comm.gather(dict(arrays))
         if parts is None:
             return None
-        return {f: np.concatenate([part[f] for part in parts]) for f in self.layout.fields}
+        return {f: self.layout.to_scene(f, np.concatenate([part[f] for part in parts])) for f in self.layout.fields}
 
     def _check(self, scene: Scene) -> None:
         for name in self.layout.fields:
@@ -170,8 +174,13 @@ class System:
         if block is None:
             block = CSR(np.zeros(sizes[0][0] + 1, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))
         bsize = (self.layout.block_size(r), self.layout.block_size(c))
-        csr = (block.indptr.astype(PETSc.IntType), block.indices.astype(PETSc.IntType), block.data)
+        csr = (_petsc_int(block.indptr), _petsc_int(block.indices), block.data)
         return PETSc.Mat().createAIJ(sizes, bsize=bsize, csr=csr, comm=self.layout.comm)
+
+
+def _petsc_int(values: Integers) -> Integers:
+    """Integers as PETSc has them, without a copy where they are that already."""
+    return values.astype(PETSc.IntType, copy=False)
 
 
 def _set_values(matrix: PETSc.Mat, rc: tuple[str, str], block: CSR | None) -> None:
@@ -182,6 +191,6 @@ def _set_values(matrix: PETSc.Mat, rc: tuple[str, str], block: CSR | None) -> No
     start = matrix.getOwnershipRange()[0]
     # setValuesCSR numbers rows from the first local one
     try:
-        matrix.setValuesCSR(block.indptr.astype(PETSc.IntType), block.indices.astype(PETSc.IntType), block.data)
+        matrix.setValuesCSR(_petsc_int(block.indptr), _petsc_int(block.indices), block.data)
     except PETSc.Error as e:
         raise PatternChanged(f"block {rc}: an entry is new (first local row {start})") from e

@@ -28,10 +28,13 @@ class ContactTransform(WrapperPC):
     The inner PC is set up on a MatNest with the contact column and row of J~ and, in place of the
     other blocks, S^1 = J_ij - J~_i1 J~_11^-1 J~_1j (eq:S^1). All products are as small as the
     fractures; other blocks of J are passed on by reference. `intf_force` and `momentum` become one
-    field `mechanics`: one AIJ matrix that keeps the block size for multigrid.
+    field `mechanics`: one matrix that keeps the block size for multigrid, and the only copy that is
+    made of the large block of `momentum`.
 
     Options, with the prefix of this PC:
         -qr_side right|left|none: the transformation.
+        -qr_mechanics_mat_type aij|hypre: storage of the block of mechanics; hypre, the default where the
+            options give that field a PCHYPRE, saves PCHYPRE its own copy.
         -qr_pc_type, ...: the inner PC, whose fields are contact, mechanics, intf_flow, mass.
 
     The operator must be a MatNest over the five fields, or those of them that a scene has.
@@ -62,7 +65,10 @@ class ContactTransform(WrapperPC):
         self._contact, self._intf_force = nest.getNestISs()[0][:2]
         inner_members = merge_mechanics(names)
         inner_problem = replace(problem, blocks=eliminated)
-        return field_nest(inner_members, eliminated, problem.layout), field_dm(inner_problem, inner_members)
+        kinds = ("hypre", "aij") if _hypre_suffices(pc) else ("aij", "hypre")
+        mat_type = choice(pc, "qr_mechanics_mat_type", kinds)
+        matrix = field_nest(inner_members, eliminated, problem.layout, mat_type)
+        return matrix, field_dm(inner_problem, inner_members)
 
     def _eliminate(self, J: Blocks, problem: Problem) -> Blocks:
         """Blocks of J~ in the row and column of contact, of S^1 elsewhere."""
@@ -117,6 +123,20 @@ class ContactTransform(WrapperPC):
         return f"inner PC on {where} with the exact Schur complement of contact"
 
 
+def _hypre_suffices(pc: PETSc.PC) -> bool:
+    """Whether the inner solver only ever multiplies with the block of mechanics and hands it to PCHYPRE.
+
+    Schur complements that PETSc assembles multiply matrices, which it cannot in hypre's storage. Local.
+    """
+    prefix = (pc.getOptionsPrefix() or "") + ContactTransform.prefix
+    leaf = "fieldsplit_mechanics_pc_type"
+    chosen = {k: str(v) for k, v in PETSc.Options().getAll().items() if k.startswith(prefix)}
+    levels = [k.removesuffix(leaf) for k in chosen if k.endswith(leaf)]
+    assembling = {chosen.get(level + "pc_fieldsplit_schur_precondition") for level in levels} & {"selfp", "full"}
+    wanted = bool(levels) and all(chosen[level + leaf] == "hypre" for level in levels)
+    return wanted and not assembling and bool(PETSc.Sys.hasExternalPackage("hypre"))
+
+
 def add_product(M: PETSc.Mat | None, A: PETSc.Mat, B: PETSc.Mat) -> PETSc.Mat:
     """M + A B as a new matrix with the block sizes of A's rows and B's columns."""
     X = A.matMult(B)
@@ -146,11 +166,11 @@ def block_diagonal_inverse(A: PETSc.Mat, what: str, problem: Problem) -> PETSc.M
         bad = np.flatnonzero(singular(dense))
         if bad.size:
             cell = int(bad[0])
-            state = ""
+            state, name = "", what.rsplit(" ", 1)[-1]
             if "contact" in what and problem.contact_state is not None:
                 state = f" ({CONTACT_STATES[int(problem.contact_state[cell])]})"
             raise SceneError(
-                f"{what}: singular at cell {first // D + cell}{state}"
+                f"{what}: singular at cell {problem.layout.scene_cell(name, first // D + cell)}{state}"
                 + (f", and at {bad.size - 1} more on this rank" if bad.size > 1 else "")
                 + "; the contact unknowns cannot be eliminated"
             )

@@ -110,7 +110,7 @@ class Adapter:
                 f"the linear system of the model is {matrix.shape[0]} x {matrix.shape[1]}, but its equation "
                 f"system has {n} unknowns; take the scene from the full system, before any reduction"
             )
-        matrix = matrix.tocsr(copy=True)
+        matrix = matrix.tocsr()  # of the model itself if it is in rows already: the same matrix in its canonical form
         matrix.sum_duplicates()
         matrix.eliminate_zeros()
         cells = {f: self._grids[f] for f in rows}

@@ -1,0 +1,209 @@
+"""Memory by phase, and that the large blocks of a scene are not held more often than needed."""
+
+import gc
+import weakref
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+from sample import SCENES, full_scene
+
+from petsc_fs import hdf5, memory, options
+from petsc_fs import scene as scene_module
+from petsc_fs.layout import Layout
+from petsc_fs.scene import CSR, Scene
+from petsc_fs.solver import Solver
+
+MIB = 1 << 20
+linux = pytest.mark.skipif(not memory.CLEAR.exists(), reason="needs Linux's /proc")
+
+
+@pytest.fixture
+def clean_options():
+    database = PETSc.Options()
+    before = database.getAll()
+    yield database
+    for name in database.getAll():
+        if name not in before:
+            database.delValue(name)
+
+
+@pytest.fixture
+def returns_freed():
+    if not memory.return_freed():
+        pytest.skip("needs glibc")
+
+
+@linux
+def test_a_phase_has_its_own_peak(returns_freed: None):
+    phases = memory.Phases()
+    array = np.ones(8 * MIB)
+    del array
+    phases.end("large")
+    phases.end("small")
+    assert phases.separate
+    assert phases.peaks["large"] - phases.start > 60 * MIB > phases.helds["large"] - phases.start
+    assert phases.peaks["small"] < phases.peaks["large"] - 50 * MIB
+
+
+def test_without_proc_the_peak_is_that_of_the_process(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    before = memory.peak()
+    monkeypatch.setattr(memory, "STATUS", tmp_path / "status")
+    monkeypatch.setattr(memory, "CLEAR", tmp_path / "nowhere" / "clear_refs")
+    phases = memory.Phases()
+    phases.end("read")
+    phases.end("solve")
+    assert not phases.separate
+    assert before // 2 < phases.peaks["read"] <= phases.peaks["solve"]
+
+
+@pytest.mark.mpi
+def test_report_has_every_rank():
+    comm = MPI.COMM_WORLD
+    phases = memory.Phases()
+    phases.peaks, phases.helds = {"a": 10 + comm.rank, "b": 5}, {"a": 1, "b": 2}
+    report = phases.report(comm)
+    assert report["peak"] == {"a": [10 + r for r in range(comm.size)], "b": [5] * comm.size}
+    assert report["held"]["b"] == [2] * comm.size == [2 for _ in report["start"]]
+    assert report["peak_all_ranks"] == sum(10 + r for r in range(comm.size))
+
+
+def test_text():
+    report = {"start": [1, 1], "peak": {"read": [3 * MIB, 5 * MIB], "solve": [1, 2]}, "peak_all_ranks": 2000 * MIB}
+    assert memory.text(report) == "peak memory of a rank: read 5 MiB, solve 2 B; of all 2 ranks 1.95 GiB"
+    assert memory.text(report | {"start": [1]}) == "peak memory: read 5 MiB, solve 2 B"
+
+
+def test_units():
+    assert [memory.in_units(n) for n in (999, 1000, 1023 * MIB, 20 * 1024 * MIB)] == [
+        "999 B",
+        "0.977 KiB",
+        "0.999 GiB",
+        "20 GiB",
+    ]
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("release", [False, True])
+def test_source_is_freed_once_petsc_has_it(release: bool):
+    scene = full_scene()
+    before = {rc: weakref.ref(block.data) for rc, block in scene.blocks.items()}
+    solver = Solver(scene, release=release)
+    gc.collect()
+    assert not solver.scene.blocks
+    assert bool(scene.blocks) is not release
+    assert all((ref() is None) is release for ref in before.values())
+    solver.destroy()
+
+
+@linux
+def test_building_does_not_hold_the_matrix_twice(returns_freed: None):
+    scene = banded_scene(rows=12_000, width=150)
+    entries = scene.blocks["momentum", "momentum"].data.size
+    phases = memory.Phases()
+    solver = Solver(scene, MPI.COMM_SELF, release=True)
+    phases.end("build")
+    per_entry = (phases.helds["build"] - phases.start) / entries
+    assert abs(per_entry) < 3, "a copy is 12 bytes an entry"
+    solver.destroy()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("name", ["model1", "model3"])
+def test_storage_of_mechanics_changes_nothing(name: str, clean_options: PETSc.Options):
+    options.insert(options.find_options_file("contact_poromechanics.opts"))
+    scene = hdf5.read(SCENES / f"{name}.h5")
+    clean_options.setValue("ksp_max_it", 12)
+    histories, types = [], []
+    for mat_type in (None, "aij"):
+        if mat_type:
+            clean_options.setValue("qr_mechanics_mat_type", mat_type)
+        solver = Solver(scene)
+        solver.solve()
+        histories.append(solver.history())
+        block = mechanics_block(solver)
+        types.append(block.getType())
+        assert block.getBlockSize() == scene.dimension
+        solver.destroy()
+    assert types[0] == "hypre" and types[1].endswith("aij")
+    np.testing.assert_allclose(histories[0][:8], histories[1][:8], rtol=1e-6)
+
+
+@pytest.mark.parametrize("change", [{"pc_type": "gamg"}, {"precondition": "selfp"}])
+def test_storage_of_mechanics_stays_aij_where_hypre_would_not_do(change: dict[str, str], clean_options: PETSc.Options):
+    options.insert(options.find_options_file("contact_poromechanics.opts"))
+    names = {
+        "pc_type": "qr_fieldsplit_1_fieldsplit_mechanics_pc_type",
+        "precondition": "qr_fieldsplit_1_pc_fieldsplit_schur_precondition",
+    }
+    for what, value in change.items():
+        clean_options.setValue(names[what], value)
+    solver = Solver(hdf5.read(SCENES / "model1.h5"), MPI.COMM_SELF)
+    try:
+        solver.set_up()
+    except Exception:  # such a solver need not work on a nest; its matrix is there before
+        pass
+    assert mechanics_block(solver).getType() == "seqaij"
+    solver.destroy()
+
+
+def test_matrix_is_cut_into_the_same_blocks_in_any_pieces(monkeypatch: pytest.MonkeyPatch):
+    rng = np.random.default_rng(1)
+    n = 30
+    dense = rng.standard_normal((n, n)) * (rng.random((n, n)) < 0.4) + np.eye(n)
+    order = rng.permutation(n)
+    fields = {"momentum": order[:20], "mass": order[20:]}
+    rows, columns = np.nonzero(dense)
+    matrix = CSR(np.searchsorted(rows, np.arange(n + 1)), columns, dense[rows, columns])
+    results = []
+    for slab in (1, 7, 1 << 20):
+        monkeypatch.setattr(scene_module, "SLAB", slab)
+        results.append(Scene.from_matrix(matrix, np.ones(n), fields, dimension=2).blocks)
+    for found in results:
+        assert found.keys() == results[0].keys()
+        for rc, block in found.items():
+            for a, b in zip(block, results[-1][rc], strict=True):
+                np.testing.assert_array_equal(a, b)
+    r, c = "momentum", "mass"
+    block = results[0][r, c]
+    part = np.zeros((20, 10))
+    part[np.repeat(np.arange(20), np.diff(block.indptr)), block.indices] = block.data
+    np.testing.assert_array_equal(part, dense[np.ix_(fields[r], fields[c])])
+
+
+@pytest.mark.mpi
+def test_rounding_level_is_the_same_in_any_pieces(monkeypatch: pytest.MonkeyPatch):
+    from petsc_fs import system
+
+    scene = full_scene()
+    solver = Solver(scene, layout=Layout.contiguous(MPI.COMM_WORLD, 2, scene.sizes))
+    solution = solver.system.by_field(solver.system.b)
+    levels = []
+    for slab in (3, 1 << 20):
+        monkeypatch.setattr(system, "SLAB", slab)
+        levels.append(solver.system.rounding_level(solution))
+    assert levels[0] == pytest.approx(levels[1], rel=1e-12) and levels[0] > 0
+    solver.destroy()
+
+
+def mechanics_block(solver: Solver) -> PETSc.Mat:
+    """The block of mechanics that the inner PC of ContactTransform works on."""
+    _, nest = solver.ksp.getPC().getPythonContext().inner.getOperators()
+    return nest.getNestSubMatrix(1, 1)
+
+
+def banded_scene(rows: int, width: int) -> Scene:
+    """One field of displacements with `2 width` entries in most rows."""
+    first = np.maximum(np.arange(rows) - width, 0)
+    last = np.minimum(np.arange(rows) + width, rows)
+    indptr = np.concatenate([[0], np.cumsum(last - first)])
+    indices = (np.arange(indptr[-1]) - np.repeat(indptr[:-1] - first, last - first)).astype(PETSc.IntType)
+    block = CSR(indptr.astype(PETSc.IntType), indices, np.ones(indices.size))
+    return Scene(
+        dimension=3,
+        sizes={"momentum": rows},
+        blocks={("momentum", "momentum"): block},
+        rhs={"momentum": np.ones(rows)},
+    )
