@@ -50,12 +50,12 @@ def together(comm: MPI.Intracomm) -> Iterator[None]:
         yield
     except Exception as e:
         error = e
-    first = next((e for e in comm.allgather(error and _portable(error)) if e is not None), None)
+    first = next((e for e in comm.allgather(error and portable(error)) if e is not None), None)
     if first is not None:
         raise first from error
 
 
-def _portable(error: Exception) -> Exception:
+def portable(error: BaseException) -> Exception:
     """An error that pickles: ours as they are, any other one by its text."""
     if isinstance(error, PetscFsError | MemoryError):
         return error

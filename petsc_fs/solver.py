@@ -19,6 +19,7 @@ from petsc4py import PETSc
 
 from petsc_fs.errors import PetscFsError, SolveError, UsageError, together
 from petsc_fs.layout import Layout
+from petsc_fs.partition import chosen_kind, partition
 from petsc_fs.scene import Scene
 from petsc_fs.system import FieldArrays, PatternChanged, System
 
@@ -39,6 +40,7 @@ class Result:
         converged: whether the true residual of the untransformed system meets the tolerance.
         reason: PETSc's name of the reason why the Krylov method stopped.
         true_relative_residual: |b - J x| / |b|.
+        rtol: relative tolerance that the Krylov method had.
         tolerance: what `true_relative_residual` is held against: the larger of the relative
             tolerance and the absolute one / |b|; or, where rounding forbids to meet that, ten units
             of rounding, |J| |x| + |b| taken entry by entry.
@@ -48,7 +50,7 @@ class Result:
             absolute error where the reference is zero.
         setup_seconds: building PETSc's matrices and setting the preconditioner up, for this solve.
         solve_seconds: the Krylov method.
-        solution: local rows of each field.
+        solution: local rows of each field, in the order of the layout; `System.gather` gives the scene's.
     """
 
     iterations: int
@@ -62,6 +64,7 @@ class Result:
     setup_seconds: float
     solve_seconds: float
     solution: FieldArrays = field(repr=False)
+    rtol: float = 0.0
 
 
 _numbers = itertools.count()
@@ -86,13 +89,24 @@ class Solver:
     Options:
         -petsc_fs_mat_type nest|merged|aij: storage of the Jacobian; aij copies the blocks into one matrix,
             merged only those of mechanics, where ContactTransform does not.
+        -petsc_fs_partition auto|rcb|ptscotch|contiguous: which rank gets which cells, see `petsc_fs.partition`.
         -petsc_fs_restarts n: how often the Krylov method may start again from its own solution where the
             true residual misses the tolerance that its recursive estimate has met; default 2.
         -petsc_fs_true_rtol r: relative true residual that counts as converged; default -ksp_rtol.
+
+    Attributes:
+        rtol: relative tolerance of the Krylov method, from the options.
+        rebuilds: how often matrices and preconditioner were made anew because the pattern had changed.
     """
 
     def __init__(
-        self, scene: Scene, comm: MPI.Intracomm | None = None, *, layout: Layout | None = None, prefix: str = ""
+        self,
+        scene: Scene,
+        comm: MPI.Intracomm | None = None,
+        *,
+        layout: Layout | None = None,
+        prefix: str = "",
+        release: bool = False,
     ) -> None:
         """Build the system; nothing is factored yet.
 
@@ -101,8 +115,10 @@ class Solver:
         Args:
             scene: all rows on every rank, or the rows of this rank as `layout` has them.
             comm: communicator, default MPI_COMM_WORLD.
-            layout: distribution of rows; default contiguous.
+            layout: distribution of rows; default by -petsc_fs_partition where the scene is whole, else contiguous.
             prefix: of all options of this solver, including its own.
+            release: empty `scene.blocks` while PETSc's matrices are made, for callers that have no other use
+                for them: matrix and scene are then not both in memory.
 
         Raises:
             SceneError: the scene does not fit together.
@@ -114,7 +130,7 @@ class Solver:
         self.ksp: Any = None
         self._number = next(_numbers)
         _live.add(self)
-        whole = layout or Layout.contiguous(mpi, scene.dimension, scene.sizes)
+        whole = layout or self._layout_of(scene, mpi)
         self.layout = whole.only(f for f in whole.fields if whole.sizes(f)[1])
         options = PETSc.Options(prefix)
         mat_type = options.getString("petsc_fs_mat_type", "nest")
@@ -122,18 +138,30 @@ class Solver:
             raise UsageError(f"-{prefix}petsc_fs_mat_type {mat_type}: expected {' or '.join(MAT_TYPES)}")
         with together(mpi):
             self.scene = self._part(scene)
-        self._storage = {"mat_type": mat_type, **needed_data(prefix)}
+        if release:
+            scene.blocks.clear()
+        self._storage = {"mat_type": mat_type, "release": True, **needed_data(prefix)}
         self.system = System(self.scene, self.layout, **self._storage)
         self.ksp = self._create_ksp()
         self.restarts = options.getInt("petsc_fs_restarts", 2)
-        self.true_rtol = options.getReal("petsc_fs_true_rtol", self.ksp.getTolerances()[0])
+        self.rtol = float(self.ksp.getTolerances()[0])
+        self.true_rtol = options.getReal("petsc_fs_true_rtol", self.rtol)
+        self.rebuilds = 0
         self.x = self.system.J.createVecRight()
         self._built_seconds = time.perf_counter() - started
 
     def _part(self, scene: Scene) -> Scene:
         """The rows of this rank, of the fields that have any unknowns."""
         part = scene.only(self.layout.fields)
-        return part if part.rows is not None else part.restrict({f: self.layout.rows(f) for f in self.layout.fields})
+        return part if part.rows is not None else part.restrict(self.layout)
+
+    def _layout_of(self, scene: Scene, comm: MPI.Intracomm) -> Layout:
+        """By -petsc_fs_partition, where every rank has the whole scene; parts are taken for contiguous ones."""
+        kind = chosen_kind(self.prefix)
+        whole = comm.allreduce(scene.rows is None, MPI.LAND)
+        if whole and comm.size > 1:
+            return partition(scene, comm, kind, self.prefix)
+        return Layout.contiguous(comm, scene.dimension, scene.sizes)
 
     def _create_ksp(self) -> PETSc.KSP:
         ksp = PETSc.KSP().create(self.layout.comm)
@@ -167,6 +195,8 @@ class Solver:
             self.ksp.destroy()
             self.system = System(self.scene, self.layout, **self._storage)
             self.ksp = self._create_ksp()
+            self.rebuilds += 1
+        self.scene.blocks.clear()
         self.ksp.setOperators(self.system.J, self.system.J)  # or KSPSetUp leaves the set-up to the first product
         collect_garbage(self.layout.comm)
         self._built_seconds = time.perf_counter() - started
@@ -186,15 +216,20 @@ class Solver:
             raise _ours(e, "set-up failed") from None
         self._built_seconds += time.perf_counter() - started
 
-    def solve(self) -> Result:
+    def solve(self, rtol: float | None = None) -> Result:
         """Solve for the right-hand side of the scene, from a zero initial guess. Collective.
 
         A Krylov method that stops early is no error: see `Result.converged` and `Result.reason`.
+
+        Args:
+            rtol: relative tolerance of this solve, if a looser one than -ksp_rtol is enough; the true residual is
+                held against -petsc_fs_true_rtol made looser by as much.
 
         Raises:
             SolveError: PETSc failed on the way, or the solution is not finite.
         """
         self.set_up()
+        self.ksp.setTolerances(rtol=max(self.rtol, rtol or 0.0))
         result = self._run(0, 0.0)
         for _ in range(self.restarts):
             if result.converged or not result.reason.startswith("CONVERGED") or not result.iterations:
@@ -229,7 +264,8 @@ class Solver:
                 f"the solution is not finite after {iterations} iterations ({reason})"
                 + (hint if "PC" in reason else "")
             )
-        tolerance = max(self.true_rtol, self.ksp.getTolerances()[1] / size)
+        rtol, atol, *_ = self.ksp.getTolerances()
+        tolerance = max(self.true_rtol * (rtol / self.rtol if self.rtol else 1.0), atol / size)
         solution = system.by_field(self.x)
         limited = False
         if relative > tolerance:
@@ -241,6 +277,7 @@ class Solver:
             converged=bool(relative <= tolerance),
             reason=reason,
             true_relative_residual=relative,
+            rtol=rtol,
             tolerance=tolerance,
             limited_by_rounding=limited,
             residual_by_field={f: n / size for f, n in norms.items()},
@@ -313,6 +350,8 @@ def _ours(error: Exception, what: str) -> PetscFsError:
             return cause
         if isinstance(cause, ImportError) or (isinstance(cause, PETSc.Error) and cause.ierr in REFUSALS):
             return UsageError(f"PETSc refuses an option: {brief(cause)}")
+        if isinstance(cause, Exception) and not isinstance(cause, PETSc.Error):
+            return SolveError(f"{what}: {type(cause).__name__}: {cause}")
         cause = cause.__cause__ or cause.__context__
     return SolveError(f"{what}: {brief(error)}")
 

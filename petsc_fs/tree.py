@@ -7,7 +7,7 @@ a level superfluous, that level disappears and what was inside moves up, with it
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 Options = dict[str, "str | None"]
 FLOW = ("intf_flow", "mass")
+
+CANONICAL = "contact_poromechanics.opts"
+"""Options file with all levels."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +102,15 @@ class Facts:
         """Whether the Schur complement of mechanics differs from the mass block: both must act on each other."""
         both_ways = self.flow_moves_rock and self.rock_moves_flow
         return bool(self.mechanics) and "mass" in self.fields and self.fixed_stress and both_ways
+
+    def for_all_contact_states(self) -> Facts:
+        """Facts that hold in all Newton steps of a run: fracture cells open and close, and stick at times."""
+        return replace(self, contact_acts=self.contact, contact_singular=self.contact)
+
+    def or_either(self, other: Facts) -> Facts:
+        """What is true here or there, so that a level that was needed once is kept."""
+        names = [f.name for f in fields(Facts) if f.name != "fields"]
+        return replace(self, **{name: getattr(self, name) or getattr(other, name) for name in names})
 
     @classmethod
     def of(cls, scene: Scene, comm: MPI.Intracomm) -> Facts:

@@ -107,7 +107,7 @@ def padded(scene: Scene, fields: tuple[str, ...]) -> Scene:
 def flow_levels(prefix: str = "") -> Levels:
     return {
         prefix: "fieldsplit",
-        f"{prefix}fieldsplit_intf_flow_": "bjacobi",
+        f"{prefix}fieldsplit_intf_flow_": "asm",
         f"{prefix}fieldsplit_mass_": "hypre",
     }
 

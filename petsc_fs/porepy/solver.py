@@ -1,36 +1,58 @@
-"""FieldSplitSolver: a mixin with which a PorePy model solves its linear systems by petsc_fs.
+"""FieldSplitSolver: a mixin with which a PorePy model solves its linear systems by petsc_fs, on all ranks.
 
     class MyModel(FieldSplitSolver, pp.poromechanics.Poromechanics): ...
 
-    model = MyModel({"petsc_fs_options_file": "contact_poromechanics.opts", ...})
+    model = MyModel({...})
     pp.run_time_dependent_model(model, {})
     print(sum(solve.iterations for solve in model.linear_solves))
 
+Started with `mpiexec -n 4 python script.py`, rank 0 runs PorePy and the script, and the other ranks help to solve.
 PorePy itself is not imported here.
 """
 
 from __future__ import annotations
 
+import logging
+import math
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from petsc_fs import options
-from petsc_fs.errors import UsageError
+from petsc_fs import options, server
+from petsc_fs.errors import SceneError, SolveError, UsageError
 from petsc_fs.fields import in_order
+from petsc_fs.forcing import EisenstatWalker, EisenstatWalkerParameters
+from petsc_fs.pattern import UnionPattern
 from petsc_fs.scene import Scene, contact_state_counts
+from petsc_fs.tree import CANONICAL, Facts, Tree, smallest_tree
 
 if TYPE_CHECKING:
     from petsc_fs.porepy.adapter import Adapter
-    from petsc_fs.solver import Solver
+    from petsc_fs.server import ServedSolver
+    from petsc_fs.solver import Result, Solver
 
 Floats = NDArray[np.float64]
+
+logger = logging.getLogger("petsc_fs")
+
+ON_FAILURE = ("accept", "retry", "raise")
+"""Values of -petsc_fs_on_failure; the first is the default."""
+
+FORCING = ("fixed", "eisenstat_walker")
+"""Values of -petsc_fs_forcing; the first is the default."""
+
+RETRY = "retry_"
+"""Prefix of the options of the second solve."""
+
+RETRY_FILE = "retry.opts"
+"""Options file of the second solve, if -petsc_fs_retry_file names no other."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +63,25 @@ class LinearSolve:
         time_step: from 1.
         newton_index: from 0 in each time step.
         unknowns: size of the system.
+        ranks: number of ranks that solved it.
         iterations: of the outer Krylov method.
         reason: PETSc's name of the reason why it stopped.
         converged: whether the true residual meets the tolerance; see `petsc_fs.solver.Result`.
         true_relative_residual: |b - J x| / |b|.
+        forcing: relative tolerance that was asked for: -ksp_rtol, or the forcing term of inexact Newton.
+        nonlinear_residual: norm of the residual, as Newton measures it, at the iterate that the system was
+            assembled at.
+        action: "" if the solve converged at first; else what -petsc_fs_on_failure did: "accepted" (the update
+            was used as it is), "retried" (the numbers here are those of the second solve, the seconds of both)
+            or "raised" (the run ended).
+        failure: what went wrong at first, in words; "" if nothing.
         contact_states: number of sticking, sliding and open fracture cells at the iterate that the
             system was assembled at; empty without contact.
-        seconds: of the whole solve, including the copy to PETSc and back.
+        rebuilds: how often, in this run so far, PETSc's objects were made anew because the sparsity had
+            changed, or the grids.
+        seconds: of the whole solve: the sum of the next three and a little.
+        transfer_seconds: of cutting PorePy's matrix into fields, sending values to the ranks and getting the
+            update back into PorePy's order.
         setup_seconds: of building PETSc's matrices and setting the preconditioner up.
         solve_seconds: of the Krylov method.
     """
@@ -63,36 +97,94 @@ class LinearSolve:
     seconds: float
     setup_seconds: float
     solve_seconds: float
+    transfer_seconds: float = 0.0
+    ranks: int = 1
+    forcing: float = float("nan")
+    nonlinear_residual: float = float("nan")
+    action: str = ""
+    failure: str = ""
+    rebuilds: int = 0
+
+
+@dataclass
+class _Chosen:
+    """Options of a model, and where they come from.
+
+    Attributes:
+        values: by name without the model's prefix.
+        file: the options file, if one is named.
+        tree: else the smallest solver for the model.
+    """
+
+    values: Mapping[str, str | None]
+    file: Path | None = None
+    tree: Tree | None = None
+
+
+@dataclass
+class _Outcome:
+    """A solve and what became of it."""
+
+    result: Result | None
+    action: str = ""
+    failure: str = ""
+    setup_seconds: float = 0.0
+    solve_seconds: float = 0.0
+    transfer_seconds: float = 0.0
+    error: SolveError | None = field(default=None, repr=False)
 
 
 class FieldSplitSolver:
-    """Mixin that solves a model's linear systems on one rank by what an options file says.
+    """Mixin that solves a model's linear systems on all ranks by what an options file says.
 
-    It goes before the model's other bases, and takes these from the model's parameters:
+    It goes before the model's other bases. On several ranks, rank 0 alone gets past the construction of the first
+    such model: the others work for it until its process ends, and end with it (see `petsc_fs.server`). What a script
+    does after that, it does once. On one rank nothing is sent anywhere.
 
-    - `petsc_fs_options_file`: path of the options file, or name of a shipped one; default is the
-      shipped default for the fields of the model;
+    From the model's parameters it takes:
+
+    - `petsc_fs_options_file`: path of the options file, or name of a shipped one; default is the smallest
+      solver for the fields and couplings of the model, cut from contact_poromechanics.opts;
     - `petsc_fs_options_prefix`: put before all option names, default "".
 
     The options of the file are in PETSc's database only while a system is being solved, and what
     stands there already goes first: after `petsc4py.init(sys.argv)` the command line wins, and
-    models with different files do not disturb each other.
+    models with different files do not disturb each other. An option that does nothing in the first solve ends the
+    run; -petsc_fs_allow_unused names those that may (see `petsc_fs.options`).
 
-    A solve that ends before its tolerance is met is used all the same, as in the paper; look at
-    `linear_solves` for those.
+    Options beside those of `petsc_fs.solver.Solver`:
+        -petsc_fs_on_failure accept|retry|raise: what happens to a solve that misses its tolerance, with a warning
+            to the logger "petsc_fs". accept uses the update all the same, as the paper did, as long as the linear
+            residual is less than that of no update at all. It is the default: what Newton's method needs is a
+            smaller residual, whether it got there it sees for itself, and a second solve by stronger means may not
+            fit into memory. retry solves again by another options file, and raises if that fails too.
+        -petsc_fs_retry_file FILE: for retry, default retry.opts; its options get the prefix retry_.
+        -petsc_fs_forcing fixed|eisenstat_walker: solve to -ksp_rtol, or each system only as far as Newton makes use
+            of it, but never further than to -ksp_rtol; see `petsc_fs.forcing.EisenstatWalker`. Residuals are
+            measured as Newton does, by the model's `compute_residual_norm`.
+        -petsc_fs_ew_rtol0, _rtolmax, _gamma, _alpha, _threshold: see `petsc_fs.forcing.EisenstatWalkerParameters`.
 
     Attributes:
         linear_solves: one record per solve, in the order of solving.
     """
 
     params: dict[str, Any]
+    linear_system: tuple[Any, Floats]
     linear_solves: list[LinearSolve]
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self._client = server.join()
         super().__init__(*args, **kwargs)
         self.linear_solves = []
         self._adapter: Adapter | None = None
-        self._solver: Solver | None = None
+        self._solver: Solver | ServedSolver | None = None
+        self._chosen: _Chosen | None = None
+        self._facts: Facts | None = None
+        self._forcing: EisenstatWalker | None = None
+        self._union = UnionPattern()
+        self._newton_tolerance: float | None = None
+        self._reference_residual: Floats | None = None
+        self._earlier_rebuilds = 0
 
     def solve_linear_system(self) -> Floats:
         """The Newton update, in PorePy's order.
@@ -101,7 +193,7 @@ class FieldSplitSolver:
             LayoutError: the model has unknowns or equations that belong to no field.
             SceneError: the linear system has entries that are not finite.
             UsageError: the options file cannot be used, or has an option that nothing asked for.
-            SolveError: PETSc failed, or the solution is not finite.
+            SolveError: PETSc failed, the solution is not finite, or -petsc_fs_on_failure ends the run.
         """
         from petsc_fs.porepy.adapter import Adapter
 
@@ -109,80 +201,249 @@ class FieldSplitSolver:
         if self._adapter is None:
             self._adapter = Adapter(self)
         scene = self._adapter.scene()
-        with inserted(self._options_file(scene), self._options_prefix):
-            solver = self._updated_solver(scene)
-            result = solver.solve()
+        cut_seconds = time.perf_counter() - started
+        chosen = self._choose(scene)
+        with inserted(chosen.values, self._options_prefix):
+            residual = self._nonlinear_residual(scene)
+            outcome = self._solve_by_policy(scene, self._forcing_term(residual))
             if not self.linear_solves:
-                self._refuse_unused(scene)
-        update = self._adapter.to_porepy(result.solution)
+                self._refuse_unused(chosen)
+        assert outcome.result is not None
+        back = time.perf_counter()
+        update = self._adapter.to_porepy(outcome.result.solution)
         states = scene.contact_state
         self.linear_solves.append(
             LinearSolve(
                 time_step=scene.metadata.time_step_index,
                 newton_index=scene.metadata.newton_index,
                 unknowns=update.size,
-                iterations=result.iterations,
-                reason=result.reason,
-                converged=result.converged,
-                true_relative_residual=result.true_relative_residual,
+                ranks=1 if self._client is None else self._client.comm.size,
+                iterations=outcome.result.iterations,
+                reason=outcome.result.reason,
+                converged=outcome.result.converged,
+                true_relative_residual=outcome.result.true_relative_residual,
+                forcing=outcome.result.rtol,
+                nonlinear_residual=residual,
+                action=outcome.action,
+                failure=outcome.failure,
                 contact_states={} if states is None else contact_state_counts(states),
+                rebuilds=self._rebuilds,
                 seconds=time.perf_counter() - started,
-                setup_seconds=result.setup_seconds,
-                solve_seconds=result.solve_seconds,
+                transfer_seconds=cut_seconds + outcome.transfer_seconds + time.perf_counter() - back,
+                setup_seconds=outcome.setup_seconds,
+                solve_seconds=outcome.solve_seconds,
             )
         )
+        if outcome.error is not None:
+            raise outcome.error
         return update
+
+    def check_convergence(self, *args: Any, **kwargs: Any) -> Any:
+        """PorePy's own, which tells on the way what the nonlinear tolerance is."""
+        given = kwargs.get("nl_params", args[-1] if args else None)
+        if isinstance(given, dict):
+            tolerance = float(given.get("nl_convergence_tol_res", math.inf))
+            self._newton_tolerance = tolerance if math.isfinite(tolerance) else None
+        return super().check_convergence(*args, **kwargs)  # type: ignore[misc]
+
+    # Options
 
     @property
     def _options_prefix(self) -> str:
         return str(self.params.get("petsc_fs_options_prefix", ""))
 
-    def _options_file(self, scene: Scene) -> Path:
+    def _choose(self, scene: Scene) -> _Chosen:
+        """The options of the file, or of the smallest tree for what the model has shown so far."""
         name = self.params.get("petsc_fs_options_file")
-        if name is None:
-            return options.default_for(scene.fields)
-        header = options.read_header(options.find_options_file(str(name)))
-        if not header.fits(scene.fields):
-            raise UsageError(
-                f"{header.path.name} is for models with the fields {', '.join(header.fields)}; "
-                f"this one has {', '.join(in_order(scene.fields))}"
-            )
-        return header.path
-
-    def _updated_solver(self, scene: Scene) -> Solver:
-        """The solver with the values of the scene; a new one where the grids have changed."""
+        if name is not None:
+            if self._chosen is None:
+                file = _fitting_file(str(name), scene)
+                self._chosen = _Chosen(options.parse(file), file=file)
+            return self._chosen
         from petsc4py import PETSc
 
-        from petsc_fs.solver import Solver
+        facts = Facts.of(scene, PETSc.COMM_SELF.tompi4py()).for_all_contact_states()
+        if self._facts is not None:
+            facts = facts.or_either(self._facts)
+        if self._chosen is None or facts != self._facts:
+            self._forget_solver()
+            tree = smallest_tree(options.parse(options.find_options_file(CANONICAL)), facts)
+            self._chosen, self._facts = _Chosen(tree.options, tree=tree), facts
+        return self._chosen
 
-        if self._solver is not None and dict(scene.sizes) != {
-            f: self._solver.layout.sizes(f)[1] for f in self._solver.layout.fields
-        }:
-            self._solver.destroy()
-            self._solver = None
+    def _refuse_unused(self, chosen: _Chosen) -> None:
+        """Raise a UsageError if an option did nothing."""
+        retries = self._option("petsc_fs_on_failure", ON_FAILURE) == "retry"
+        later = f"{self._options_prefix}{RETRY}"
+        useless = [n for n in options.refused(options.unused()) if not (retries and n.startswith(later))]
+        if not useless:
+            return
+        typed = {word[1:] for word in sys.argv if word.startswith("-")}
+        left_out = chosen.tree.left_out if chosen.tree is not None else ()
+        raise UsageError(options.explain(sorted(useless), typed, chosen.file, left_out))
+
+    def _option(self, name: str, choices: tuple[str, ...]) -> str:
+        from petsc4py import PETSc
+
+        value = str(PETSc.Options(self._options_prefix).getString(name, choices[0]))
+        if value not in choices:
+            raise UsageError(f"-{self._options_prefix}{name} {value}: expected {' or '.join(choices)}")
+        return value
+
+    # Newton
+
+    def _nonlinear_residual(self, scene: Scene) -> float:
+        """Norm of the residual as Newton judges it; the right-hand side is the residual with the other sign."""
+        _, rhs = self.linear_system
+        if scene.metadata.newton_index == 0 or self._reference_residual is None:
+            self._reference_residual = np.array(rhs)
+            if self._forcing is not None:
+                self._forcing.restart()
+        norm = getattr(self, "compute_residual_norm", None)
+        if norm is None:
+            return float(np.linalg.norm(rhs) / math.sqrt(rhs.size or 1))
+        return float(norm(rhs, self._reference_residual))
+
+    def _forcing_term(self, residual: float) -> float | None:
+        """Relative tolerance of the next solve; None for -ksp_rtol."""
+        if self._option("petsc_fs_forcing", FORCING) == "fixed":
+            return None
+        if self._forcing is None:
+            from petsc4py import PETSc
+
+            given = PETSc.Options(f"{self._options_prefix}petsc_fs_ew_")
+            names = {f.name: f.default for f in fields(EisenstatWalkerParameters)}
+            self._forcing = EisenstatWalker(
+                EisenstatWalkerParameters(**{name: given.getReal(name, default) for name, default in names.items()})
+            )
+        return self._forcing.term(residual, self._newton_tolerance)
+
+    # Solving
+
+    def _solve_by_policy(self, scene: Scene, rtol: float | None) -> _Outcome:
+        """Solve, and do what -petsc_fs_on_failure says where the tolerance is missed."""
+        policy = self._option("petsc_fs_on_failure", ON_FAILURE)
+        outcome = self._attempt(scene, rtol, retry=policy == "retry")
+        if not outcome.failure:
+            return outcome
+        where = f"time step {scene.metadata.time_step_index}, Newton step {scene.metadata.newton_index}"
+        if policy == "retry":
+            logger.warning("%s: %s; solving again by stronger means", where, outcome.failure)
+            return self._second_attempt(scene, rtol, outcome, where)
+        assert outcome.result is not None
+        if policy == "raise" or not outcome.result.true_relative_residual < 1:
+            outcome.action = "raised"
+            useless = "" if policy == "raise" else "; the update is no better than none"
+            outcome.error = SolveError(f"{where}: {outcome.failure}{useless}")
+        else:
+            outcome.action = "accepted"
+            logger.warning("%s: %s; the update is used all the same", where, outcome.failure)
+        return outcome
+
+    def _attempt(self, scene: Scene, rtol: float | None, *, retry: bool) -> _Outcome:
+        """Solve by the options of the model; an error is a failure like any other if there is a second attempt."""
+        try:
+            solver = self._updated_solver(scene)
+            return _outcome(solver, solver.solve(rtol))
+        except (SolveError, SceneError) as e:
+            self._forget_solver()
+            if not retry:
+                raise
+            return _Outcome(None, failure=str(e))
+
+    def _second_attempt(self, scene: Scene, rtol: float | None, first: _Outcome, where: str) -> _Outcome:
+        from petsc4py import PETSc
+
+        prefix = f"{self._options_prefix}{RETRY}"
+        name = PETSc.Options(self._options_prefix).getString("petsc_fs_retry_file", RETRY_FILE)
+        file = _fitting_file(name, scene)
+        with inserted(file, prefix):
+            solver = self._create_solver(scene, prefix)
+            try:
+                second = _outcome(solver, solver.solve(rtol))
+            finally:
+                solver.destroy()
+        if second.failure:
+            second.action = "raised"
+            second.error = SolveError(f"{where}: {first.failure}; again by {file.name}: {second.failure}")
+        else:
+            second.action = "retried"
+        second.failure = first.failure
+        for name in ("setup_seconds", "solve_seconds", "transfer_seconds"):
+            setattr(second, name, getattr(first, name) + getattr(second, name))
+        return second
+
+    def _updated_solver(self, scene: Scene) -> Solver | ServedSolver:
+        """The solver with the values of the scene; a new one where the grids have changed."""
+        if self._client is None:  # a served solver sees to these itself
+            if self._solver is not None:
+                layout = self._solver.layout
+                if {f: n for f, n in scene.sizes.items() if n} != {f: layout.sizes(f)[1] for f in layout.fields}:
+                    self._forget_solver()
+            if self._solver is None:
+                self._union = UnionPattern()
+            scene = self._union.fit(scene)
         if self._solver is None:
-            self._solver = Solver(scene, PETSc.COMM_SELF.tompi4py(), prefix=self._options_prefix)
+            self._solver = self._create_solver(scene, self._options_prefix)
         else:
             self._solver.update(scene)
         return self._solver
 
-    def _refuse_unused(self, scene: Scene) -> None:
-        """Raise a UsageError if an option of the file did nothing."""
-        prefix, file = self._options_prefix, self._options_file(scene)
-        useless = {prefix + name for name in options.parse(file)} & set(options.unused())
-        if not useless:
-            return
-        raise UsageError(options.explain(sorted(useless), file=file))
+    def _create_solver(self, scene: Scene, prefix: str) -> Solver | ServedSolver:
+        if self._client is not None:
+            return server.ServedSolver(self._client, scene, prefix=prefix)
+        from petsc4py import PETSc
+
+        from petsc_fs.solver import Solver
+
+        return Solver(scene, PETSc.COMM_SELF.tompi4py(), prefix=prefix)
+
+    def _forget_solver(self) -> None:
+        if self._solver is not None:
+            self._earlier_rebuilds = self._rebuilds + 1
+            self._solver.destroy()
+            self._solver = None
+
+    @property
+    def _rebuilds(self) -> int:
+        return self._earlier_rebuilds + (self._solver.rebuilds if self._solver is not None else 0)
+
+
+def _outcome(solver: Solver | ServedSolver, result: Result) -> _Outcome:
+    """What came of a solve, in words if it missed its tolerance."""
+    failure = ""
+    if not result.converged:
+        failure = (
+            f"{result.reason} after {result.iterations} iterations, true residual "
+            f"{result.true_relative_residual:.2e}, tolerance {result.tolerance:.2e}"
+        )
+    transfer = getattr(solver, "transfer_seconds", 0.0)
+    return _Outcome(result, "", failure, result.setup_seconds, result.solve_seconds, transfer)
+
+
+def _fitting_file(name: str, scene: Scene) -> Path:
+    """An options file that is for the fields of a scene.
+
+    Raises:
+        UsageError: there is no such file, or it is for other fields.
+    """
+    header = options.read_header(options.find_options_file(name))
+    if not header.fits(scene.fields):
+        raise UsageError(
+            f"{header.path.name} is for models with the fields {', '.join(header.fields)}; "
+            f"this one has {', '.join(in_order(scene.fields))}"
+        )
+    return header.path
 
 
 @contextmanager
-def inserted(file: Path, prefix: str = "") -> Iterator[None]:
-    """Have the options of a file in PETSc's database within a block; what is set there already stays.
+def inserted(values: Path | Mapping[str, str | None], prefix: str = "") -> Iterator[None]:
+    """Have options in PETSc's database within a block; what is set there already stays.
 
     Local.
 
     Args:
-        file: options file.
+        values: options file, or options by name.
         prefix: put before each name.
 
     Raises:
@@ -192,7 +453,8 @@ def inserted(file: Path, prefix: str = "") -> Iterator[None]:
 
     database = PETSc.Options()
     already = database.getAll()
-    new = {prefix + name: value for name, value in options.parse(file).items() if prefix + name not in already}
+    chosen = options.parse(values) if isinstance(values, Path) else values
+    new = {prefix + name: value for name, value in chosen.items() if prefix + name not in already}
     for name, value in new.items():
         database.setValue(name, value)
     try:

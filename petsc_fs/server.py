@@ -1,0 +1,469 @@
+"""One rank has whole scenes, the others help to solve them: PETSc's linear-solver server, for scenes.
+
+A program that is serial, such as a simulator in Python, runs on rank 0. The other ranks wait in a loop for what
+rank 0 asks of them, as with PETSc's own `-mpi_linear_solver_server` (PCMPI), which knows one matrix without fields.
+
+    client = server.start()  # ranks other than 0 come back when rank 0 has called client.stop(), with None
+    if client is not None:
+        solver = ServedSolver(client, scene)  # as petsc_fs.solver.Solver
+        result = solver.solve()  # result.solution has all rows
+        solver.update(next_scene)
+        client.stop()
+
+Where a scene goes is decided once: partition, parts of the pattern and places of their values in rank 0's arrays.
+After that, one message per rank brings the values of matrix and right-hand side and the cell data that change.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import numpy as np
+from mpi4py import MPI
+from mpi4py.util import pkl5
+
+from petsc_fs.errors import SolveError, UsageError, portable, together
+from petsc_fs.layout import Layout
+from petsc_fs.pattern import UnionPattern
+from petsc_fs.scene import Floats, Integers, Scene
+from petsc_fs.transfer import Plan, Structure, changes_of, same_frame
+
+if TYPE_CHECKING:
+    from petsc_fs.solver import Result, Solver
+
+SECONDS_TO_AGREE = 5.0
+"""How long a rank that failed waits for the others before it takes them for stuck."""
+
+SHORTEST_NAP, LONGEST_NAP = 1e-5, 5e-3
+"""Seconds between two looks for a message: the longest keeps a waiting rank below 1 % of a core."""
+
+
+# Rank 0
+
+
+class Client:
+    """Rank 0's end of the server.
+
+    Attributes:
+        comm: communicator of all ranks.
+        running: whether the other ranks listen.
+    """
+
+    def __init__(self, comm: MPI.Intracomm) -> None:
+        """Use `start`, which lets the other ranks listen."""
+        self.comm = comm
+        self.running = True
+        self.rank = _Rank(comm)
+        self._handles = 0
+        self._dropped: list[int] = []
+        self._options: dict[str, str | None] | None = None
+
+    def new_handle(self) -> int:
+        """A number for one more solver."""
+        self._handles += 1
+        return self._handles
+
+    def call(self, command: str, *args: Any, load: Any = None) -> Any:
+        """Have all ranks do something, with the options database as it is here. Collective for those who listen.
+
+        An interrupt from the keyboard has to wait until all ranks are through.
+
+        Args:
+            command: name of a method of `_Rank`.
+            args: sent to all ranks.
+            load: what only rank 0 gets.
+
+        Raises:
+            UsageError: the server is stopped.
+            PetscFsError: the error of the lowest rank that had one, on rank 0.
+        """
+        if not self.running:
+            raise UsageError("the server is stopped; petsc_fs.server.start() starts another one")
+        with _interrupts_later():
+            while self._dropped:
+                self._send("drop", self._dropped.pop())
+            options = _database()
+            if options != self._options:
+                self._send("set_options", options)
+                self._options = options
+            return self._send(command, *args, load=load)
+
+    def drop(self, handle: int) -> None:
+        """Forget a solver on all ranks, at the next opportunity. Local: garbage collection may call it."""
+        self._dropped.append(handle)
+
+    def stop(self) -> None:
+        """Let the other ranks go, once; collective with them. May be called twice."""
+        global _client  # noqa: PLW0603
+        if not self.running:
+            return
+        try:
+            self._send("close")
+        finally:
+            self.running = False
+            atexit.unregister(self.stop)
+            if _client is self:
+                _client = None
+
+    def _send(self, command: str, *args: Any, load: Any = None) -> Any:
+        for other in range(1, self.comm.size):
+            self.rank.control.send((command, args), other)
+        return self.rank.execute(command, args, load)
+
+
+_client: Client | None = None
+
+
+def start(comm: MPI.Intracomm | None = None) -> Client | None:
+    """Start the server, where none is running. Collective.
+
+    Rank 0 goes on at once; when its process ends, for whatever reason, the server stops by itself. The other ranks
+    come back when it does.
+
+    Args:
+        comm: all ranks that take part, default MPI_COMM_WORLD.
+
+    Returns:
+        The client on rank 0, None on the other ranks.
+    """
+    global _client  # noqa: PLW0603
+    if _client is not None:
+        return _client
+    import petsc_fs.solver  # noqa: F401  (its work at exit comes after the stop, on all ranks alike)
+
+    _restore_terminate()
+    comm = comm or MPI.COMM_WORLD
+    if comm.rank > 0:
+        _serve(_Rank(comm))
+        return None
+    _client = Client(comm)
+    atexit.register(_client.stop)
+    return _client
+
+
+def join() -> Client | None:
+    """Start the server for the rest of the program: ranks other than 0 end here, when rank 0 does. Collective.
+
+    Returns:
+        The client; None where there is only one rank, which needs no server.
+    """
+    if MPI.COMM_WORLD.size == 1:
+        return None
+    client = start()
+    if client is None:
+        leave()
+    return client
+
+
+def leave() -> NoReturn:
+    """End this process with exit code 0, as C's `exit` does: what stands after this in the program is for rank 0.
+
+    `finally` clauses of the program are left out, PETSc and MPI end in good order. Collective.
+    """
+    from petsc4py import PETSc
+
+    atexit._run_exitfuncs()
+    PETSc._finalize()
+    if not MPI.Is_finalized():
+        MPI.Finalize()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)
+
+
+class ServedSolver:
+    """`petsc_fs.solver.Solver` on all ranks, for scenes that rank 0 has. On rank 0 only.
+
+    Attributes:
+        layout: distribution of the rows.
+        rebuilds: how often matrices and preconditioner were made anew because the pattern had grown or the grids
+            had changed.
+        transfer_seconds: spent since the last update began on bringing the scene to the ranks and solutions back.
+    """
+
+    def __init__(self, client: Client, scene: Scene, *, prefix: str = "") -> None:
+        """Distribute a scene and build the system; nothing is factored yet.
+
+        Args:
+            client: of a running server.
+            scene: all rows.
+            prefix: of all options of the solver.
+
+        Raises:
+            PetscFsError: see `petsc_fs.solver.Solver`.
+        """
+        self.prefix = prefix
+        self.rebuilds = -1
+        self._client = client
+        self._handle = client.new_handle()
+        self._like: Scene | None = None
+        self.layout: Layout
+        self.update(scene)
+
+    def update(self, scene: Scene) -> None:
+        """Take the values of another scene.
+
+        PETSc's objects are kept where sizes and cells are the same and every entry has been there before.
+        """
+        started = time.perf_counter()
+        known = self._client.rank.knows(self._handle)
+        if self._like is None or not known or not same_frame(scene, self._like):
+            self._union = UnionPattern()
+            self.layout = self._client.call("make_layout", self._handle, self.prefix, load=scene)
+        fitted = self._union.fit(scene)
+        if self._union.grew:
+            self.rebuilds += 1
+            self._plan = Plan(fitted, self.layout)
+            self._client.call("take_structure", self._handle, load=self._plan.take_structures())
+        self._like = replace(scene, blocks={}, rhs={}, reference={})
+        packed = self._plan.pack(fitted), self._plan.counts
+        self.transfer_seconds = time.perf_counter() - started
+        self.transfer_seconds += self._client.call("take_values", self._handle, changes_of(fitted), load=packed)
+
+    def solve(self, rtol: float | None = None) -> Result:
+        """Solve; see `petsc_fs.solver.Solver.solve`.
+
+        Args:
+            rtol: relative tolerance of this solve.
+
+        Returns:
+            What the solve did; `solution` has all rows of each field in the scene's numbering.
+        """
+        result: Result
+        result, parts, seconds = self._client.call("solve", self._handle, rtol)
+        started = time.perf_counter()
+        solution = self._plan.unpack(parts)
+        self.transfer_seconds += seconds + time.perf_counter() - started
+        return replace(result, solution=solution)
+
+    def destroy(self) -> None:
+        """Forget it on all ranks. May be called twice."""
+        self._client.drop(self._handle)
+
+    def __del__(self) -> None:
+        self.destroy()
+
+
+# All ranks
+
+
+@dataclass
+class _Kept:
+    """What a rank keeps of one solver."""
+
+    prefix: str
+    layout: Layout
+    structure: Structure | None = None
+    values: Floats | None = None
+    solver: Solver | None = None
+
+
+class _Rank:
+    """What all ranks can do together; the methods are the commands of the server, each collective."""
+
+    def __init__(self, comm: MPI.Intracomm) -> None:
+        self.comm = comm
+        self.control = pkl5.Intracomm(comm.Dup())  # its messages may be larger than 2 GiB
+        self._kept: dict[int, _Kept] = {}
+
+    def execute(self, command: str, args: Sequence[Any], load: Any = None) -> Any:
+        """Do something on all ranks. Collective.
+
+        Raises:
+            Exception: if any rank failed: on rank 0 its own error, else that of the lowest rank; where other
+                ranks are stuck because of it, the program ends with the traceback.
+        """
+        error: BaseException | None = None
+        result = None
+        try:
+            result = getattr(self, command)(*args, load) if load is not None else getattr(self, command)(*args)
+        except BaseException as e:  # whatever it is, the other ranks have to know
+            error = e
+        self._wait_for_others(error)
+        errors = self.control.allgather(None if error is None else portable(error))
+        first = next((e for e in errors if e is not None), None)
+        if first is None:
+            return result
+        if command in ("make_layout", "take_structure", "take_values", "solve"):
+            self.drop(args[0])
+        if error is not None:
+            raise error
+        raise first
+
+    def _wait_for_others(self, error: BaseException | None) -> None:
+        arrived = self.control.Ibarrier()
+        deadline = time.monotonic() + SECONDS_TO_AGREE
+        for _ in _naps():
+            if arrived.Test():
+                return
+            if error is not None and time.monotonic() > deadline:
+                text = "".join(traceback.format_exception(error))
+                sys.stderr.write(f"{text}on rank {self.comm.rank}, for which the other ranks wait: all are ended\n")
+                sys.stderr.flush()
+                self.comm.Abort(getattr(error, "exit_code", 1))
+
+    def wait(self) -> tuple[str, tuple[Any, ...]]:
+        """The next command of rank 0, waited for without burning a core. Not on rank 0."""
+        for _ in _naps():
+            if self.control.iprobe(source=0):
+                break
+        command: tuple[str, tuple[Any, ...]] = self.control.recv(source=0)
+        return command
+
+    def knows(self, handle: int) -> bool:
+        """Whether a solver is there. Local, the same on all ranks."""
+        return handle in self._kept
+
+    def set_options(self, options: Mapping[str, str | None]) -> None:
+        """Take over rank 0's options database."""
+        from petsc4py import PETSc
+
+        if self.comm.rank == 0:
+            return
+        database = PETSc.Options()
+        mine = database.getAll()
+        for name in mine.keys() - options.keys():
+            database.delValue(name)
+        for name, value in options.items():
+            if name not in mine or mine[name] != value:
+                database.setValue(name, value)
+
+    def make_layout(self, handle: int, prefix: str, scene: Scene | None = None) -> Layout:
+        """Decide by -petsc_fs_partition which rank gets what; rank 0 has the scene."""
+        from petsc_fs.partition import chosen_kind, partition
+
+        self.drop(handle)
+        layout = partition(scene, self.comm, chosen_kind(prefix), prefix)
+        self._kept[handle] = _Kept(prefix, layout)
+        return layout
+
+    def take_structure(self, handle: int, structures: list[Structure] | None = None) -> None:
+        """Get from rank 0 what stays the same from solve to solve."""
+        kept = self._kept[handle]
+        if kept.solver is not None:
+            kept.solver.destroy()
+        kept.solver = kept.values = None
+        if structures is None:
+            kept.structure = self.control.recv(source=0)
+            return
+        kept.structure, *others = structures
+        for rank, structure in enumerate(others, start=1):
+            self.control.send(structure, rank)
+
+    def take_values(self, handle: int, changes: dict[str, Any], load: tuple[Floats, Integers] | None = None) -> float:
+        """Get the values from rank 0, and build or update the system; seconds that the values took to come."""
+        started = time.perf_counter()
+        kept = self._kept[handle]
+        assert kept.structure is not None
+        with together(self.comm):  # memory may run out on one of them
+            values = np.empty(kept.structure.size) if kept.values is None else kept.values
+        kept.values = values
+        self.comm.Scatterv(None if load is None else [load[0], load[1]], kept.values, root=0)
+        part = kept.structure.part(kept.values, changes)
+        seconds = time.perf_counter() - started
+        if kept.solver is None:
+            from petsc_fs.solver import Solver
+
+            kept.solver = Solver(part, self.comm, layout=kept.layout, prefix=kept.prefix)
+        else:
+            kept.solver.update(part)
+        return seconds
+
+    def solve(self, handle: int, rtol: float | None) -> tuple[Result, Floats, float]:
+        """What the solve did; on rank 0 the solution of all ranks, one after the other; seconds it took to come."""
+        solver = self._kept[handle].solver
+        if solver is None:
+            raise SolveError("there is nothing to solve: an earlier error left no system")
+        result = solver.solve(rtol)
+        started = time.perf_counter()
+        own = np.concatenate([result.solution[f] for f in solver.layout.fields])
+        counts = self.comm.gather(own.size)
+        whole = np.empty(0 if counts is None else sum(counts))
+        self.comm.Gatherv(own, None if counts is None else [whole, counts], root=0)
+        return result, whole, time.perf_counter() - started
+
+    def drop(self, handle: int) -> None:
+        """Forget a solver."""
+        kept = self._kept.pop(handle, None)
+        if kept is not None and kept.solver is not None:
+            kept.solver.destroy()
+
+    def close(self) -> None:
+        """Forget all solvers."""
+        for handle in sorted(self._kept):
+            self.drop(handle)
+
+
+def _serve(rank: _Rank) -> None:
+    """Do what rank 0 asks for, until it asks to stop. An interrupt from the keyboard is for rank 0 to handle."""
+    before = signal.getsignal(signal.SIGINT)
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if in_main_thread:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        command = ""
+        while command != "close":
+            command, args = rank.wait()
+            try:
+                rank.execute(command, args)
+            except Exception:
+                pass  # rank 0 has it too, and says what happens next
+    finally:
+        if in_main_thread and before is not None:
+            signal.signal(signal.SIGINT, before)
+
+
+def _naps() -> Iterator[None]:
+    """Naps that grow longer and longer; the first look comes before the first nap."""
+    nap = SHORTEST_NAP
+    while True:
+        yield
+        time.sleep(nap)
+        nap = min(1.5 * nap, LONGEST_NAP)
+
+
+@contextmanager
+def _interrupts_later() -> Iterator[None]:
+    """Keep an interrupt from the keyboard back until the end of the block; a second one comes through at once."""
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield
+        return
+    came: list[int] = []
+
+    def remember(number: int, frame: Any) -> None:
+        if came:
+            before(number, frame)
+        came.append(number)
+
+    signal.signal(signal.SIGINT, remember)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if came:
+        signal.raise_signal(signal.SIGINT)
+
+
+def _restore_terminate() -> None:
+    """Let a request to terminate end the process as before PETSc, which would explain it on every rank at length."""
+    handler = signal.getsignal(signal.SIGTERM)
+    if threading.current_thread() is threading.main_thread() and handler is not None:
+        signal.signal(signal.SIGTERM, handler)
+
+
+def _database() -> dict[str, str | None]:
+    """PETSc's options database."""
+    from petsc4py import PETSc
+
+    return dict(PETSc.Options().getAll())

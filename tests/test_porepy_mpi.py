@@ -1,0 +1,338 @@
+"""PorePy models that solve on several ranks: the same states as with a direct solver, and every way to end.
+
+The programs run in processes of their own, with PorePy on rank 0.
+"""
+
+import json
+import logging
+import os
+import signal
+import time
+
+import numpy as np
+import pytest
+from programs import SECONDS_TO_END, Program
+
+pytestmark = pytest.mark.porepy
+LIMIT = 280
+
+SAME_STATES = """
+import json, sys
+import petsc4py; petsc4py.init(["program"])
+import numpy as np
+from petsc_fs.porepy import Adapter, FieldSplitSolver, make_model, run
+from petsc_fs.porepy.direct import solve
+from petsc_fs.porepy.models import StopRun
+
+class Watch:
+    def after_nonlinear_convergence(self, *args):
+        super().after_nonlinear_convergence(*args)
+        self.states.append(self.equation_system.get_variable_values(time_step_index=0))
+        if len(self.states) == self.limit:
+            raise StopRun
+
+name, refinement, limit, tolerance = sys.argv[1], *map(float, sys.argv[2:])
+
+def go(mixins, **how):
+    model = make_model(name, refinement=refinement, mixins=(Watch, *mixins))
+    model.states, model.limit = [], limit
+    run(model, nl_convergence_tol_res=tolerance, **how)
+    return model
+
+ours = go((FieldSplitSolver,))
+direct = go((), linear_solve=lambda model: solve(*model.linear_system))
+adapter = Adapter(direct)
+pairs = [[adapter.from_porepy(v) for v in both] for both in zip(ours.states, direct.states, strict=True)]
+found = {
+    "differences": [
+        {f: np.linalg.norm(a[f] - b[f]) / np.linalg.norm(b[f]) for f in b if np.linalg.norm(b[f])} for a, b in pairs
+    ],
+    "ranks": sorted({s.ranks for s in ours.linear_solves}),
+    "converged": all(s.converged for s in ours.linear_solves),
+    "rebuilds": ours.linear_solves[-1].rebuilds,
+    "solves": len(ours.linear_solves),
+}
+print("RESULT", json.dumps(found))
+"""
+
+SAME = {
+    "model1": (1, 2, 1e-10),
+    "model2": (0.5, 1, 1e-10),
+    "model3": (0.25, 1, 1e-9),
+    "biot": (0.5, 6, 1e-10),
+    "flow": (0.5, 6, 1e-10),
+}
+"""Refinement, time steps, nonlinear tolerance. The tolerance is far below the residual that a time step begins with:
+PorePy takes whatever is below it, be it the state of the time step before."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def pp():
+    return pytest.importorskip("porepy", reason="PorePy is not installed")
+
+
+@pytest.mark.parametrize("name", SAME)
+def test_states_are_those_of_a_direct_solver_at_every_time_step(tmp_path, name):
+    code, out, err = Program(tmp_path, SAME_STATES, arguments=(name, *map(str, SAME[name]))).end(LIMIT)
+    assert code == 0, err
+    (line,) = [line for line in out.splitlines() if line.startswith("RESULT")]
+    found = json.loads(line.removeprefix("RESULT"))
+    assert found["ranks"] == [2]
+    assert found["converged"]
+    assert len(found["differences"]) == SAME[name][1]
+    for step in found["differences"]:
+        assert step
+        assert max(step.values()) < 1e-5, step
+    assert found["rebuilds"] < found["solves"]
+
+
+USERS_SCRIPT = """
+import numpy as np, porepy as pp
+from petsc_fs.porepy import FieldSplitSolver
+
+class Mine(FieldSplitSolver, pp.SinglePhaseFlow):
+    def bc_values_pressure(self, boundary_grid):
+        return boundary_grid.cell_centers[0]
+
+model = Mine({"times_to_export": []})
+pp.run_time_dependent_model(model, {"progressbars": False})
+print("ranks", {solve.ranks for solve in model.linear_solves})
+"""
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_ten_lines(tmp_path, ranks):
+    """A whole script; what stands after the construction of the model happens once."""
+    code, out, err = Program(tmp_path, USERS_SCRIPT, ranks).end(LIMIT)
+    assert code == 0, err
+    assert [line for line in out.splitlines() if line] == [f"ranks {{{ranks}}}"]
+
+
+# Ends
+
+FLOW = """
+import os, signal, sys, time
+import petsc4py; petsc4py.init(["program"])
+import porepy as pp
+from petsc_fs.porepy import FieldSplitSolver, make_model, run
+
+with open(f"pid{os.environ.get('OMPI_COMM_WORLD_RANK', os.environ.get('PMI_RANK', '0'))}", "w") as file:
+    file.write(str(os.getpid()))
+
+class Breaks:
+    def before_nonlinear_iteration(self):
+        super().before_nonlinear_iteration()
+        if self.time_manager.time_index == 2:
+            print("now", flush=True)
+            ENDING
+
+model = make_model("flow", refinement=0.5, mixins=(Breaks, FieldSplitSolver))
+run(model)
+print("after")
+"""
+
+
+@pytest.mark.parametrize(
+    ("ending", "last"),
+    [
+        ("raise RuntimeError('broken inside the model')", "RuntimeError: broken inside the model"),
+        ("raise KeyboardInterrupt", "KeyboardInterrupt"),
+    ],
+)
+def test_an_exception_inside_the_model_ends_all(tmp_path, ending, last):
+    program = Program(tmp_path, FLOW.replace("ENDING", ending))
+    program.wait_for("now", LIMIT)
+    started = time.monotonic()
+    code, out, err = program.end(60)
+    assert time.monotonic() - started < SECONDS_TO_END
+    assert code != 0
+    assert "after" not in out
+    assert err.count("Traceback") == 1
+    assert last in err
+
+
+@pytest.mark.parametrize("victim", [0, 1])
+def test_a_killed_rank_ends_all(tmp_path, victim):
+    program = Program(tmp_path, FLOW.replace("ENDING", "time.sleep(60)"))
+    program.wait_for("now", LIMIT)
+    os.kill(int((tmp_path / f"pid{victim}").read_text()), signal.SIGKILL)
+    started = time.monotonic()
+    code, _, err = program.end(60)
+    assert time.monotonic() - started < SECONDS_TO_END
+    assert code != 0
+    assert "Traceback" not in err
+    assert "PETSC ERROR" not in err
+
+
+DIVERGES = """
+import petsc4py; petsc4py.init(["program"])
+import porepy as pp
+from petsc_fs.porepy import FieldSplitSolver, make_model, run
+
+class Cut:
+    def after_nonlinear_failure(self):
+        super().after_nonlinear_failure()
+        print("cut", flush=True)
+
+model = make_model("model1", refinement=0.5, mixins=(Cut, FieldSplitSolver))
+times = pp.TimeManager(schedule=[0, 4e4], dt_init=4e4, dt_min_max=(1e4, 4e4), iter_max=4, iter_optimal_range=(2, 3))
+{times}
+run(model, max_iterations=1)
+print("after")
+"""
+
+
+def test_newton_failure_ends_all(tmp_path):
+    program = Program(tmp_path, DIVERGES.format(times=""))
+    code, out, err = program.end(LIMIT)
+    assert code != 0
+    assert "after" not in out
+    assert err.count("SolveError: model1 (refinement=0.5): Newton did not converge in time step 1") == 1
+
+
+def test_a_time_step_cut_goes_on_until_the_least_step(tmp_path):
+    program = Program(tmp_path, DIVERGES.format(times="model.time_manager = times"))
+    code, out, err = program.end(LIMIT)
+    assert code != 0
+    assert out.count("cut") >= 1
+    assert err.count("\nValueError") + err.count("\npetsc_fs.errors.SolveError") >= 1
+
+
+# Solves that miss their tolerance, on one rank
+
+
+@pytest.fixture
+def first_solve():
+    """Record and update of the first linear solve of a small model, with these PETSc options."""
+    from petsc4py import PETSc
+
+    from petsc_fs.porepy import FieldSplitSolver, make_model, run
+    from petsc_fs.porepy.models import StopRun
+
+    names = []
+
+    def go(name="flow", **given):
+        found = []
+        for option, value in given.items():
+            PETSc.Options().setValue(option, value)
+            names.append(option)
+        model = make_model(name, refinement=0.5, mixins=(FieldSplitSolver,))
+        go.model = model
+
+        def look(model, update):
+            found.extend([model.linear_solves[-1], update])
+            raise StopRun
+
+        run(model, on_newton_step=look)
+        return found
+
+    yield go
+    for option in names:
+        PETSc.Options().delValue(option)
+
+
+def test_accepting_is_the_default(first_solve, caplog):
+    with caplog.at_level(logging.WARNING, "petsc_fs"):
+        record, update = first_solve(ksp_max_it=3)
+    assert (record.action, record.iterations, record.converged) == ("accepted", 3, False)
+    assert record.true_relative_residual < 1
+    assert record.failure.startswith("DIVERGED_MAX_IT after 3 iterations, true residual")
+    assert np.isfinite(update).all()
+    (message,) = caplog.messages
+    assert message == f"time step 1, Newton step 0: {record.failure}; the update is used all the same"
+
+
+def test_an_update_that_is_no_better_than_none_is_not_accepted(first_solve):
+    from petsc_fs.errors import SolveError
+
+    with pytest.raises(SolveError, match=r"time step 1, Newton step 0: .* the update is no better than none"):
+        first_solve(ksp_max_it=0)
+    assert [s.action for s in first_solve.model.linear_solves] == ["raised"]
+
+
+def test_raising(first_solve):
+    from petsc_fs.errors import SolveError
+
+    with pytest.raises(SolveError, match=r"time step 1, Newton step 0: DIVERGED_MAX_IT after 3 iterations, true res"):
+        first_solve(ksp_max_it=3, petsc_fs_on_failure="raise")
+    assert [(s.action, s.converged) for s in first_solve.model.linear_solves] == [("raised", False)]
+
+
+@pytest.mark.parametrize("name", ["flow", "model1"])
+def test_retrying(first_solve, caplog, name):
+    with caplog.at_level(logging.WARNING, "petsc_fs"):
+        record, _ = first_solve(name, ksp_max_it=3, petsc_fs_on_failure="retry")
+    assert (record.action, record.converged) == ("retried", True)
+    assert record.iterations <= 5
+    assert record.failure.startswith("DIVERGED_MAX_IT after 3 iterations")
+    assert caplog.messages == [f"time step 1, Newton step 0: {record.failure}; solving again by stronger means"]
+
+
+def test_retrying_after_an_error(first_solve):
+    """PETSc has no LU of a MatNest; direct.opts asks for one matrix."""
+    given = {"pc_type": "lu", "petsc_fs_allow_unused": "*", "petsc_fs_retry_file": "direct.opts"}
+    record, _ = first_solve(petsc_fs_on_failure="retry", **given)
+    assert (record.action, record.converged) == ("retried", True)
+    assert record.failure.startswith("set-up failed")
+
+
+def test_a_second_failure_ends_the_run(first_solve):
+    from petsc_fs.errors import SolveError
+
+    with pytest.raises(SolveError, match=r"again by retry.opts: DIVERGED_MAX_IT after 1 iterations") as e:
+        first_solve(ksp_max_it=3, petsc_fs_on_failure="retry", retry_ksp_max_it=1, retry_pc_type="none",
+                    petsc_fs_allow_unused="retry_*")  # fmt: skip
+    assert str(e.value).startswith("time step 1, Newton step 0: DIVERGED_MAX_IT after 3 iterations")
+    assert [s.action for s in first_solve.model.linear_solves] == ["raised"]
+
+
+def test_choices_and_unused_options(first_solve):
+    from petsc_fs.errors import UsageError
+
+    with pytest.raises(UsageError, match="-petsc_fs_on_failure ignore: expected accept or retry or raise"):
+        first_solve(petsc_fs_on_failure="ignore")
+    first_solve(petsc_fs_on_failure="accept")
+    with pytest.raises(UsageError, match="-petsc_fs_forcing walker: expected fixed or eisenstat_walker"):
+        first_solve(petsc_fs_forcing="walker")
+    with pytest.raises(UsageError, match=r"option -petsc_fs_ew_gamma from .* was not used"):
+        first_solve(petsc_fs_forcing="fixed", petsc_fs_ew_gamma="0.5")
+
+
+# Inexact Newton
+
+
+def test_inexact_newton_reaches_the_same_tolerance_with_fewer_iterations(first_solve):
+    from petsc4py import PETSc
+
+    from petsc_fs.porepy import FieldSplitSolver, make_model, run
+
+    database = PETSc.Options()
+    found = {}
+    for forcing in ("fixed", "eisenstat_walker"):
+        database.setValue("petsc_fs_forcing", forcing)
+        try:
+            model = make_model("model1", refinement=0.5, mixins=(FieldSplitSolver,))
+            ends = []
+            model.after_nonlinear_convergence = _recording(model, ends)
+            run(model)
+        finally:
+            database.delValue("petsc_fs_forcing")
+        assert len(ends) == 6
+        assert max(ends) < 1e-7
+        found[forcing] = model.linear_solves
+    exact, inexact = found["fixed"], found["eisenstat_walker"]
+    assert {s.forcing for s in exact} == {1e-10}
+    assert sum(s.iterations for s in inexact) < sum(s.iterations for s in exact)
+    assert all(1e-10 <= s.forcing <= 0.1 for s in inexact)
+    assert all(s.converged for s in inexact)
+    assert exact[0].nonlinear_residual == pytest.approx(inexact[0].nonlinear_residual)
+
+
+def _recording(model, ends):
+    original = model.after_nonlinear_convergence
+
+    def after(*args):
+        ends.append(model.nonlinear_solver_statistics.residual_norms[-1])
+        original(*args)
+
+    return after
