@@ -11,6 +11,7 @@ import sys
 import time
 import traceback
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -29,10 +30,14 @@ if TYPE_CHECKING:
 CANONICAL = "contact_poromechanics.opts"
 """Options file with all levels, from which `solve` and `options` cut the smallest tree for a scene."""
 
-TAKES_PETSC = ("solve",)
+TAKES_PETSC = ("solve", "compare", "run")
 """Commands that pass PETSc's options on."""
 
 MODULES = {
+    "compare": ("measure error against seconds of options files, and draw it", "petsc_fs.compare"),
+    "sweep": ("search a space of PETSc options for better options files", "petsc_fs.sweep"),
+    "run": ("run a PorePy model with petsc_fs as its linear solver", "petsc_fs.porepy.simulation"),
+    "discretisation": ("measure discretisation error against run time and tolerance", "petsc_fs.porepy.discretisation"),
     "export": ("run a PorePy model and write its linear systems as scenes", "petsc_fs.porepy.export"),
 }
 """Commands with a module of their own: summary, and the module. It has `add_arguments(parser)`, which describes the
@@ -58,6 +63,7 @@ PETSc options follow the scene, for example
   -options_file FILE     an options file of yours, or the name of a shipped one
   -ksp_rtol 1e-6         relative tolerance      -ksp_monitor   residual at each iteration
   -ksp_view              the solver tree         -log_view      where time goes
+  -petsc_fs_partition rcb    which rank gets which cells: auto, rcb, ptscotch or contiguous
   -petsc_fs_mat_type aij     one assembled matrix instead of blocks, for direct solvers
   -petsc_fs_true_rtol 1e-8   tolerance for the true residual, default that of -ksp_rtol
 
@@ -83,8 +89,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return int(e.code or 0)
     except PetscFsError as e:
         return _fail(comm, f"petsc-fs: {e}", e.exit_code)
-    except KeyboardInterrupt:
-        return _fail(comm, "petsc-fs: interrupted", 130)
+    except KeyboardInterrupt as e:
+        return _fail(comm, f"petsc-fs: {str(e) or 'interrupted'}", 130)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 0
@@ -145,14 +151,20 @@ def _parser(command: list[str]) -> argparse.ArgumentParser:
         sub.set_defaults(run=run)
         return sub
 
-    solve = add("solve", "solve a scene and say how well", _solve, epilog=SOLVE_EPILOG)
-    solve.add_argument("scene", metavar="SCENE", help="file, or name of a bundled scene such as model1.h5")
+    solve = add("solve", "solve a scene, or a sequence of them, and say how well", _solve, epilog=SOLVE_EPILOG)
+    solve.add_argument("scene", metavar="SCENE", help="file, or name of a bundled one such as model1.h5")
     solve.add_argument("--report", type=Path, metavar="FILE.json", help="write what was done and measured")
     solve.add_argument("--save", type=Path, metavar="FILE.h5", help="write the solution, in the scene's numbering")
+    solve.add_argument("--steps", metavar="A:B", help="of a sequence, solve these only; from 0, B excluded")
 
     inspect = add("inspect", "show fields, blocks and contact states of a scene", _inspect)
     inspect.add_argument("scene", metavar="SCENE")
+    inspect.add_argument("--step", type=int, metavar="K", help="of a sequence, show this step; from 0")
     inspect.add_argument("--plot", type=Path, metavar="FILE", help="draw the block structure (.png, .svg, .pdf)")
+    inspect.add_argument(
+        "--contraction", action="store_true", help="evaluate the condition under which fixed stress converges"
+    )
+    inspect.add_argument("--json", type=Path, metavar="FILE.json", help="with --contraction: write its numbers")
 
     options = add("options", "print the options file of the smallest solver for a scene", _options)
     options.add_argument("scene", metavar="SCENE")
@@ -162,8 +174,9 @@ def _parser(command: list[str]) -> argparse.ArgumentParser:
     lint.add_argument("scene", metavar="SCENE", nargs="?", help="scene it is for; default a bundled one that fits")
 
     convert = add("convert", "turn a scene into PETSc's binary format, or back", _convert, epilog=CONVERT_EPILOG)
-    convert.add_argument("source", metavar="SOURCE", help="scene (.h5), or folder in PETSc's format")
+    convert.add_argument("source", metavar="SOURCE", help="scene or sequence (.h5), or folder in PETSc's format")
     convert.add_argument("target", metavar="TARGET", help="folder to write, or scene (.h5)")
+    convert.add_argument("--step", type=int, metavar="K", help="of a sequence, write this step as a scene; from 0")
     convert.add_argument(
         "--dimension", type=int, choices=(2, 3), help="of the rock, where SOURCE is a folder without scene.h5"
     )
@@ -190,55 +203,62 @@ format has no place for (cell data, material, units), without which the way back
 
 
 def _solve(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
-    from petsc_fs import hdf5, options
-    from petsc_fs.layout import Layout
+    from petsc_fs import hdf5, options, sequence
 
     with together(comm):
         path = find_scene(args.scene)
-        dimension, sizes = hdf5.read_sizes(path)
-        for target in (args.report, args.save):
-            if target is not None and not target.absolute().parent.is_dir():
-                raise UsageError(f"{target}: the folder {target.absolute().parent} does not exist")
-        petsc, options_file = _with_options_file(petsc, tuple(sizes))
-        typed = {word[1:] for word in petsc if word.startswith("-") and not _is_number(word)}
+        replayed = sequence.is_sequence(path)
+        if args.steps is not None and not replayed:
+            raise UsageError(f"--steps: {path} is no sequence")
+    if replayed:
+        from petsc_fs import replay
 
-    import petsc4py
+        return replay.command(args, petsc, comm)
+    with together(comm):
+        sizes = hdf5.read_sizes(path)[1]
+        check_folders(args.report, args.save)
+        petsc, options_file = with_options_file(petsc, tuple(sizes))
+    given = GivenOptions.start_petsc(petsc, options_file)
 
-    petsc4py.init(["petsc-fs", *petsc])
     from petsc4py import PETSc
 
+    from petsc_fs.distributed_reader import read_distributed
+    from petsc_fs.memory import Phases, return_freed
+    from petsc_fs.partition import chosen_kind
     from petsc_fs.solver import Solver
 
-    given = options.unused()
-    options.insert_all({"options_left": "no"})  # newer PETSc would repeat at its end what is said here
-    layout = Layout.contiguous(comm, dimension, sizes)
+    return_freed()
+    phases = Phases()
     started = time.perf_counter()
-    with together(comm):
-        scene = hdf5.read(path, lambda *_: {f: layout.rows(f) for f in layout.fields})
+    scene, layout = read_distributed(path, comm, chosen_kind(), index_type=PETSc.IntType)
     read_seconds = time.perf_counter() - started
     tree = None
     if options_file is None:
         tree = tree_for(scene, comm)
         options.insert_all(tree.options)
-    solver = Solver(scene, comm, layout=layout)
+    phases.end("read")
+    solver = Solver(scene, comm, layout=layout, release=True)
+    phases.end("build")
+    solver.set_up()
+    phases.end("set-up")
     result = solver.solve()
+    phases.end("solve")
     with together(comm):
-        useless = options.refused([name for name in options.unused() if name in given])
-        if useless:
-            left_out = tree.left_out if tree is not None else ()
-            raise UsageError(options.explain(useless, typed, options_file, left_out))
+        given.refuse_unused(tree)
 
     everything = solver.system.gather(result.solution)
+    memory = phases.report(comm)
     with together(comm):
         report = _report(
             scene,
             solver,
             result,
+            memory=memory,
             path=path,
             options_file=options_file,
             tree=tree,
             read_seconds=read_seconds,
-            database={k: v for k, v in PETSc.Options().getAll().items() if k != "options_left"},
+            database=database(),
         )
         if everything is not None and args.report is not None:
             write_text(args.report, json.dumps(report, indent=2) + "\n")
@@ -259,7 +279,66 @@ def tree_for(scene: Scene, comm: MPI.Intracomm) -> Tree:
     return smallest_tree(options.parse(options.find_options_file(CANONICAL)), Facts.of(scene, comm))
 
 
-def _with_options_file(petsc: list[str], fields: tuple[str, ...]) -> tuple[list[str], Path | None]:
+def check_folders(*targets: Path | None) -> None:
+    """Complain about files to write whose folder is missing.
+
+    Raises:
+        UsageError: there is one.
+    """
+    for target in targets:
+        if target is not None and not target.absolute().parent.is_dir():
+            raise UsageError(f"{target}: the folder {target.absolute().parent} does not exist")
+
+
+@dataclass(frozen=True)
+class GivenOptions:
+    """PETSc options of a call, which must not go unused.
+
+    Attributes:
+        typed: names on the command line, without the dash.
+        given: all names that PETSc started with.
+        file: the first options file, if there is one.
+    """
+
+    typed: frozenset[str]
+    given: frozenset[str]
+    file: Path | None
+
+    @classmethod
+    def start_petsc(cls, petsc: Sequence[str], file: Path | None) -> GivenOptions:
+        """Initialise PETSc with options of the command line. Collective.
+
+        Args:
+            petsc: words of the command line, as `with_options_file` returns them.
+            file: likewise.
+        """
+        import petsc4py
+
+        petsc4py.init(["petsc-fs", *petsc])
+        from petsc_fs import options
+
+        given = frozenset(options.unused())
+        options.insert_all({"options_left": "no"})  # newer PETSc would repeat at its end what is said here
+        typed = frozenset(word[1:] for word in petsc if word.startswith("-") and not _is_number(word))
+        return cls(typed, given, file)
+
+    def refuse_unused(self, tree: Tree | None = None) -> None:
+        """Complain about options that nothing has asked for, after a solve. Local.
+
+        Args:
+            tree: from which the options of the solver come where there is no file.
+
+        Raises:
+            UsageError: there are any.
+        """
+        from petsc_fs import options
+
+        useless = options.refused([name for name in options.unused() if name in self.given])
+        if useless:
+            raise UsageError(options.explain(useless, self.typed, self.file, tree.left_out if tree is not None else ()))
+
+
+def with_options_file(petsc: list[str], fields: tuple[str, ...]) -> tuple[list[str], Path | None]:
     """PETSc's arguments with every options file found and checked, and the first of them."""
     from petsc_fs import options
 
@@ -289,6 +368,7 @@ def _report(
     solver: Solver,
     result: Result,
     *,
+    memory: dict[str, Any],
     path: Path,
     options_file: Path | None,
     tree: Tree | None,
@@ -296,14 +376,6 @@ def _report(
     database: dict[str, str],
 ) -> dict[str, Any]:
     """What --report writes and the table shows."""
-    import platform
-
-    import mpi4py
-    import numpy as np
-    from petsc4py import PETSc
-
-    from petsc_fs import hdf5
-
     return {
         "scene": path.name,
         "model": scene.metadata.model,
@@ -323,28 +395,73 @@ def _report(
         "read_seconds": read_seconds,
         "setup_seconds": result.setup_seconds,
         "solve_seconds": result.solve_seconds,
+        "memory_bytes": memory,
         "options_file": options_file.name if options_file is not None else None,
         "left_out": [str(part) for part in tree.left_out] if tree is not None else [],
         "options": database,
-        "versions": {
-            **hdf5.versions(),
-            "petsc": ".".join(map(str, PETSc.Sys.getVersion())),
-            "python": platform.python_version(),
-            "numpy": np.__version__,
-            "mpi4py": mpi4py.__version__,
-        },
+        "versions": versions(),
+    }
+
+
+def database() -> dict[str, str]:
+    """The options of this run, as PETSc has them."""
+    from petsc4py import PETSc
+
+    return {k: v for k, v in PETSc.Options().getAll().items() if k != "options_left"}
+
+
+def versions() -> dict[str, str]:
+    """Version of everything that takes part in a solve."""
+    import platform
+
+    import mpi4py
+    import numpy as np
+    from petsc4py import PETSc
+
+    from petsc_fs import hdf5
+
+    return {
+        **hdf5.versions(),
+        "petsc": ".".join(map(str, PETSc.Sys.getVersion())),
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "mpi4py": mpi4py.__version__,
     }
 
 
 def _inspect(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
-    from petsc_fs import hdf5
-    from petsc_fs.tables import inspect_table
+    from petsc_fs import hdf5, sequence
+    from petsc_fs.tables import contraction_table, inspect_table, sequence_table
 
     lines = []
+    if args.contraction:
+        import petsc4py
+
+        petsc4py.init(["petsc-fs"])  # on all ranks, as its end is collective
     with together(comm):
+        if args.json is not None and not args.contraction:
+            raise UsageError("--json goes with --contraction")
         if comm.rank == 0:
-            scene = hdf5.read(find_scene(args.scene))
-            lines.append(inspect_table(scene))
+            path = find_scene(args.scene)
+            replayed = sequence.is_sequence(path)
+            if args.step is not None and not replayed:
+                raise UsageError(f"--step: {path} is no sequence")
+            if replayed and args.step is None:
+                if args.plot is not None:
+                    raise UsageError("--plot draws one step of a sequence: choose it with --step K")
+                if args.contraction:
+                    raise UsageError("--contraction is about one step of a sequence: choose it with --step K")
+                lines.append(sequence_table(path.name, sequence.read_contents(path)))
+            else:
+                scene = sequence.read(path, args.step) if replayed else hdf5.read(path)
+                lines.append(inspect_table(scene))
+                if args.contraction:
+                    from petsc_fs import contraction
+
+                    found = contraction.evaluate(scene)
+                    lines.append(contraction_table(found))
+                    if args.json is not None:
+                        write_text(args.json, found.to_json())
             if args.plot is not None:
                 from petsc_fs.plot import plot_blocks
 
@@ -394,7 +511,13 @@ def _convert(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) ->
     from petsc_fs import petsc_binary
 
     source, target = Path(args.source), Path(args.target)
-    if source.is_dir():
+    if args.step is not None:
+        from petsc_fs import hdf5, sequence
+
+        if target.suffix != ".h5":
+            raise UsageError(f"{target}: a step becomes a scene, whose name ends in .h5")
+        written = [hdf5.write(sequence.read(find_scene(args.source), args.step), target)]
+    elif source.is_dir():
         written = petsc_binary.to_scene(source, target, dimension=args.dimension)
     else:
         written = petsc_binary.from_scene(find_scene(args.source), target)
@@ -403,16 +526,18 @@ def _convert(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) ->
 
 
 def find_scene(name: str) -> Path:
-    """Path of a scene: as given, or else one that is bundled under this name.
+    """Path of a scene or sequence: as given, or else one that is bundled under this name.
 
     Raises:
         SceneError: there is neither.
     """
     path = Path(name)
-    bundled = Path(__file__).parent / "scenes"
-    if not path.exists() and path.parent == Path() and (bundled / path).exists():
-        return bundled / path
-    if not path.exists():
-        names = ", ".join(sorted(p.name for p in bundled.glob("*.h5")))
-        raise SceneError(f"{path}: no such file; bundled scenes are {names}")
-    return path
+    if path.exists():
+        return path
+    here = Path(__file__).parent
+    bundled = {kind: sorted((here / kind).glob("*.h5")) for kind in ("scenes", "sequences")}
+    for file in (*bundled["scenes"], *bundled["sequences"]):
+        if path == Path(file.name):
+            return file
+    names = ", and ".join(f"bundled {kind} are {', '.join(f.name for f in files)}" for kind, files in bundled.items())
+    raise SceneError(f"{path}: no such file; {names}")

@@ -159,15 +159,25 @@ def insert(path: Path, prefix: str = "") -> None:
     insert_all(parse(path), prefix)
 
 
-def insert_all(values: Mapping[str, str | None], prefix: str = "") -> None:
-    """Put options into PETSc's database, except those that are set there already. Local."""
+def insert_all(values: Mapping[str, str | None], prefix: str = "") -> tuple[str, ...]:
+    """Put options into PETSc's database, except those that are set there already; the names that are new. Local."""
     from petsc4py import PETSc
 
     database = PETSc.Options()
     there = database.getAll()  # asking by hasName would count as use
+    new = tuple(prefix + name for name in values if prefix + name not in there)
     for name, value in values.items():
         if prefix + name not in there:
             database.setValue(prefix + name, value)
+    return new
+
+
+def delete_all(names: Iterable[str]) -> None:
+    """Take options out of PETSc's database. Local."""
+    from petsc4py import PETSc
+
+    for name in names:
+        PETSc.Options().delValue(name)
 
 
 def _text(path: Path) -> str:

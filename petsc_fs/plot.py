@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from petsc_fs.errors import UsageError
 from petsc_fs.fields import FIELD
-from petsc_fs.scene import Scene, singular_diagonal_blocks
+from petsc_fs.scene import CONTACT_STATES, Floats, Integers, Scene, singular_diagonal_blocks
 
 
 def _pyplot() -> Any:
@@ -76,13 +77,18 @@ def plot_blocks(scene: Scene, path: str | os.PathLike[str]) -> Path:
     axes.set_xlabel("unknowns (columns)")
     axes.set_ylabel("equations (rows)")
     figure.suptitle(f"{scene.metadata.model or 'scene'}: {sum(scene.sizes.values()):,} unknowns", fontsize=11)
-    target = Path(path)
+    return _save(figure, Path(path))
+
+
+def _save(figure: Any, target: Path) -> Path:
+    """Write a picture, and forget it."""
     try:
         figure.savefig(target, dpi=120)
     except (OSError, ValueError) as e:
+        target.unlink(missing_ok=True)
         raise UsageError(f"{target}: cannot be drawn: {e}") from e
     finally:
-        plt.close(figure)
+        _pyplot().close(figure)
     return target
 
 
@@ -122,3 +128,91 @@ def stages(scene: Scene) -> list[tuple[str, dict[tuple[str, str], str]]]:
     if "intf_flow" in scene.sizes:
         steps.append(("$S^3$", {("mass", "mass"): "changed"}))
     return steps
+
+
+STATES = {
+    "sticking": ("#0072B2", "-", "o"),
+    "sliding": ("#E69F00", "--", "s"),
+    "open": ("#009E73", ":", "^"),
+}
+"""Colour, line and marker of each of `CONTACT_STATES`; the colours are Okabe and Ito's, told apart by everyone."""
+
+TIME_UNITS = {"weeks": 604800.0, "days": 86400.0, "h": 3600.0, "min": 60.0, "s": 1.0}
+"""Units of time with their length in seconds, the longest first."""
+
+
+def plot_contact_states(
+    records: Sequence[Mapping[str, Any]],
+    path: str | os.PathLike[str],
+    *,
+    title: str = "",
+    cells: tuple[Floats, Integers] | None = None,
+) -> Path:
+    """Draw the number of sticking, sliding and open fracture cells over the Newton steps of a run, as the paper does.
+
+    Shaded and white backgrounds tell the time steps apart; the axis above says when they end. To the right, if
+    they are known, the fracture cells in their places.
+
+    Args:
+        records: one per Newton step, with `time_step`, `time` in s, and `contact_states`, name to number of cells.
+        path: of the picture; its suffix chooses the format.
+        title: above the picture.
+        cells: centres (n, 3) of the fracture cells in m, and their states as in `Scene.contact_state`.
+
+    Raises:
+        UsageError: matplotlib is missing or does not know the format, or no record has contact states.
+    """
+    plt = _pyplot()
+    shown = [record for record in records if record["contact_states"]]
+    if not shown:
+        raise UsageError(f"{path}: no contact states to draw")
+    steps = np.arange(1, len(shown) + 1)
+    figure = plt.figure(figsize=(7.2 if cells is None else 10.2, 3.6), layout="constrained")
+    grid = figure.add_gridspec(1, 1 if cells is None else 2, width_ratios=None if cells is None else (2, 1))
+    axes = figure.add_subplot(grid[0, 0])
+    if cells is not None:
+        _draw_cells(figure, grid[0, 1], *cells)
+    for state, (color, line, marker) in STATES.items():
+        counts = [record["contact_states"].get(state, 0) for record in shown]
+        axes.plot(steps, counts, line, color=color, marker=marker, markersize=4, lw=1.6, label=state, clip_on=False)
+    # A time step that is tried again with a shorter length counts as one more.
+    attempts = [(record["time_step"], record["time"]) for record in shown]
+    starts = [i for i, attempt in enumerate(attempts) if i == 0 or attempt != attempts[i - 1]]
+    ends = [*starts[1:], len(shown)]
+    for start, end in list(zip(starts, ends, strict=True))[::2]:
+        axes.axvspan(start + 0.5, end + 0.5, color="#ececec", lw=0, zorder=0)
+    axes.set_xlim(0.5, len(shown) + 0.5)
+    axes.set_ylim(0, 1.05 * max(sum(record["contact_states"].values()) for record in shown))
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.yaxis.get_major_locator().set_params(integer=True)
+    axes.set_xlabel("Newton steps from the start (–)")
+    axes.set_ylabel("fracture cells (–)")
+    times = [shown[start]["time"] for start in starts]
+    unit = next(name for name, length in TIME_UNITS.items() if times[-1] >= length or length == 1.0)
+    above = axes.secondary_xaxis("top")
+    every = -(-len(starts) // 12)
+    middles = [(start + end + 1) / 2 for start, end in zip(starts, ends, strict=True)]
+    above.set_xticks(middles[::every], [f"{t / TIME_UNITS[unit]:.3g}" for t in times[::every]])
+    above.tick_params(length=0)
+    above.set_xlabel(f"end of the time step ({unit})" + (f" – {title}" if title else ""))
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=len(STATES), frameon=False)
+    return _save(figure, Path(path))
+
+
+def _draw_cells(figure: Any, place: Any, centers: Floats, states: Integers) -> None:
+    """Fracture cells in their places, by contact state; in 2D seen from above."""
+    flat = np.ptp(centers[:, 2]) == 0
+    axes = figure.add_subplot(place, projection=None if flat else "3d")
+    for number, state in enumerate(CONTACT_STATES):
+        color, _, marker = STATES[state]
+        at = centers[states == number].T / 1000
+        axes.scatter(*(at[:2] if flat else at), color=color, marker=marker, s=14)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x (km)")
+    axes.set_ylabel("y (km)")
+    axes.set_title("at the last Newton step", fontsize=10)
+    if not flat:
+        axes.set_zlabel("z (km)")
+        for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+            axis.get_major_locator().set_params(nbins=3)
+        axes.set_box_aspect(axes.get_box_aspect() if hasattr(axes, "get_box_aspect") else None, zoom=0.8)  # room for it

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 from numpy.testing import assert_allclose, assert_array_equal
 
 import petsc_fs
@@ -504,7 +505,7 @@ def test_arguments(pp, tmp_path):
     parser = argparse.ArgumentParser()
     add_arguments(parser)
     args = parser.parse_args(["flow", "--out", str(tmp_path), "--steps", "1:0", "--refine", "0.5"])
-    export_module.run(args, lambda line: None)
+    assert export_module.command(args, [], MPI.COMM_WORLD) == 0
     assert [p.name for p in tmp_path.iterdir()] == ["flow_g0.5_t1_n0.h5"]
 
 

@@ -1,4 +1,4 @@
-"""Run a model with a direct solver and write scenes of chosen Newton steps.
+"""Run a model and write scenes of chosen Newton steps, or all of them as one sequence.
 
 PorePy is imported when a run starts, not when this module is: the command line can describe the
 arguments without it.
@@ -20,12 +20,16 @@ from numpy.typing import NDArray
 from petsc_fs.errors import SceneError, UsageError
 from petsc_fs.porepy import require_porepy
 from petsc_fs.porepy.cases import CASES, FRACTURE_PERMEABILITY, PHYSICS, ModelParameters, find_case
-from petsc_fs.scene import CONTACT_STATES, Scene, contact_state_counts
+from petsc_fs.scene import Scene, contact_state_counts
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
     from petsc_fs.porepy.adapter import Adapter
+
+SOLVERS = ("direct", "fieldsplit")
+"""How a run gets from one Newton step to the next: by an accurate direct solver, for small models, or as
+`petsc_fs.porepy.FieldSplitSolver` does by default."""
 
 Floats = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -39,6 +43,9 @@ BUNDLED = {
     "contact": (2.0, "4:1"),
 }
 """Refinement and Newton step (see `Steps.parse`) of each scene that comes with the package."""
+
+BUNDLED_SEQUENCES = {"model2_run": ("model2", 1.0, 1)}
+"""Model, refinement and number of time steps of each sequence that comes with the package."""
 
 
 @dataclass(frozen=True)
@@ -98,10 +105,10 @@ class _Recorder:
         self.written: list[Path] = []
         self.pending = set(steps.numbers)
         self.mixed_pending = steps.mixed > 0
-        self.latest: tuple[Scene, Floats] | None = None
+        self.latest: tuple[Scene, Floats | None] | None = None
         self.adapter: Adapter | None = None
 
-    def __call__(self, model: Any, solution: Floats) -> None:
+    def __call__(self, model: Any, solution: Floats | None) -> None:
         """Look at one Newton step; ends the run when nothing is left to write."""
         from petsc_fs.porepy.adapter import Adapter
         from petsc_fs.porepy.models import StopRun
@@ -114,8 +121,7 @@ class _Recorder:
         scene = self.adapter.scene()
         states = {} if scene.contact_state is None else contact_state_counts(scene.contact_state)
         if self.progress is not None:
-            text = ", ".join(f"{states[s]} {s}" for s in CONTACT_STATES) if states else "no contact"
-            self.progress(f"time step {step[0]}, Newton step {step[1]}: {text}")
+            self.progress(_step_text(scene))
         mixed = bool(states) and all(states.values()) and step[0] >= self.steps.mixed
         if self.steps.every or step in self.pending or (self.mixed_pending and mixed):
             self._write(scene, solution)
@@ -140,18 +146,25 @@ class _Recorder:
         if self.mixed_pending:
             raise UsageError("steps: no Newton step of the run has sticking, sliding and open cells at once")
 
-    def _write(self, scene: Scene, solution: Floats) -> None:
+    def _write(self, scene: Scene, solution: Floats | None) -> None:
         from petsc_fs import hdf5
 
         path = self.path(scene.metadata.time_step_index, scene.metadata.newton_index)
         if path in self.written:
             return
-        if self.reference:
+        if solution is not None:
             assert self.adapter is not None
             scene.reference = self.adapter.from_porepy(solution)
         self.written.append(hdf5.write(scene, path))
         if self.progress is not None:
             self.progress(f"wrote {path}")
+
+
+def _step_text(scene: Scene) -> str:
+    """One line on a Newton step."""
+    states = {} if scene.contact_state is None else contact_state_counts(scene.contact_state)
+    text = ", ".join(f"{n} {state}" for state, n in states.items()) or "no contact"
+    return f"time step {scene.metadata.time_step_index}, Newton step {scene.metadata.newton_index}: {text}"
 
 
 def export(
@@ -161,10 +174,12 @@ def export(
     *,
     steps: str | Steps = "last",
     parameters: ModelParameters | None = None,
+    time_steps: int | None = None,
     reference: bool = False,
+    solver: str = "direct",
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Run a model with a direct solver and write scenes `MODEL_gREFINEMENT_tTIME_nNEWTON.h5`.
+    """Run a model and write scenes `MODEL_gREFINEMENT_tTIME_nNEWTON.h5`.
 
     Args:
         model_name: a name in `petsc_fs.porepy.cases.CASES`.
@@ -172,7 +187,9 @@ def export(
         directory: where the files go; made if missing.
         steps: see `Steps.parse`. The run ends after the last step asked for.
         parameters: what else to vary.
+        time_steps: the run ends after so many; None for all.
         reference: also store the solution of `petsc_fs.porepy.direct.solve`.
+        solver: one of `SOLVERS`, which takes the run from one Newton step to the next.
         progress: called with a line of text per Newton step and per file.
 
     Returns:
@@ -183,27 +200,136 @@ def export(
         SolveError: Newton did not converge.
         SceneError: a file cannot be written.
     """
-    find_case(model_name)
+    if reference and solver != "direct":
+        raise UsageError("a reference solution is that of the direct solver; leave the solver at direct")
     chosen = Steps.parse(steps) if isinstance(steps, str) else steps
     settings = parameters if parameters is not None else ModelParameters(refinement=refinement)
-    require_porepy()
-    from petsc_fs.porepy.direct import solve
-    from petsc_fs.porepy.models import make_model
-    from petsc_fs.porepy.models import run as run_model
-
-    target = Path(directory)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as e:
-        raise SceneError(f"{target}: cannot be made a directory: {e.strerror}") from e
-    model = make_model(model_name, settings)
+    model, solve = _prepare(model_name, settings, solver)
+    target = _folder(Path(directory))
 
     def path(time_step: int, newton: int) -> Path:
         return target / f"{model_name}_g{settings.refinement:g}_t{time_step}_n{newton}.h5"
 
     recorder = _Recorder(chosen, path, reference, progress)
-    run_model(model, on_newton_step=recorder, linear_solve=lambda model: solve(*model.linear_system))
+
+    def advance(model: Any) -> Floats:
+        if not reference:
+            recorder(model, None)  # before solving: the last scene of a run needs no solution
+        solution = solve(model)
+        if reference:
+            recorder(model, solution)
+        return solution
+
+    _run(model, advance, time_steps)
     return recorder.finish()
+
+
+def export_sequence(
+    model_name: str,
+    path: str | os.PathLike[str],
+    *,
+    parameters: ModelParameters | None = None,
+    time_steps: int | None = None,
+    solver: str = "direct",
+    progress: Progress | None = None,
+) -> Path:
+    """Run a model and write the linear system of every Newton step into one file, see `petsc_fs.sequence`.
+
+    A run that fails or is interrupted leaves the steps so far in an incomplete sequence beside the path.
+
+    Args:
+        model_name: a name in `petsc_fs.porepy.cases.CASES`.
+        path: of the file; its folder is made if missing.
+        parameters: what to vary.
+        time_steps: the run ends after so many; None for all.
+        solver: see `export`; of "fieldsplit" the sequence also keeps the iterations.
+        progress: called with a line of text per Newton step and per file.
+
+    Raises:
+        PetscFsError: see `export`.
+    """
+    from petsc_fs import sequence
+
+    model, solve = _prepare(model_name, parameters or ModelParameters(), solver)
+    target = Path(path)
+    _folder(target.parent)
+    writer = sequence.Writer(target, model=model.scene_name)
+    say = progress or (lambda line: None)
+    adapters: list[Adapter] = []
+
+    def advance(model: Any) -> Floats:
+        from petsc_fs.porepy.adapter import Adapter
+
+        if not adapters:
+            adapters.append(Adapter(model))
+        scene = adapters[0].scene()
+        solution = solve(model)
+        writer.append(scene, run_attributes(model))
+        say(f"step {writer.steps - 1}: {_step_text(scene)}")
+        return solution
+
+    try:
+        _run(model, advance, time_steps)
+    except BaseException:
+        if kept := writer.abandon():
+            say(f"the run did not end; {kept} has its first {writer.steps} Newton steps")
+        raise
+    say(f"wrote {writer.finish()}")
+    return target
+
+
+def run_attributes(model: Any) -> dict[str, Any]:
+    """What a sequence keeps of the last linear solve of a model; nothing if it is not a `FieldSplitSolver`."""
+    solves = getattr(model, "linear_solves", None)
+    if not solves:
+        return {}
+    last = solves[-1]
+    names = ("ranks", "iterations", "reason", "converged", "action", "rebuilds", "setup_seconds", "solve_seconds")
+    inexact = {} if model._forcing is None else {"forcing": last.forcing}
+    return {name: getattr(last, name) for name in names} | inexact
+
+
+def _prepare(model_name: str, parameters: ModelParameters, solver: str) -> tuple[Any, Callable[[Any], Floats]]:
+    """The model, and what takes it from one Newton step to the next.
+
+    Raises:
+        UsageError: there is no such model or solver, or PorePy is missing.
+    """
+    find_case(model_name)
+    if solver not in SOLVERS:
+        raise UsageError(f"solver {solver!r}: expected {' or '.join(SOLVERS)}")
+    require_porepy()
+    from petsc_fs.porepy.direct import solve
+    from petsc_fs.porepy.lean_model import LeanModel
+    from petsc_fs.porepy.models import make_model
+    from petsc_fs.porepy.solver import FieldSplitSolver
+
+    if solver == "direct":
+        model = make_model(model_name, parameters, mixins=(LeanModel,))
+        return model, lambda model: solve(*model.linear_system)
+    model = make_model(model_name, parameters, mixins=(FieldSplitSolver, LeanModel))
+    return model, FieldSplitSolver.solve_linear_system
+
+
+def _run(model: Any, advance: Callable[[Any], Floats], time_steps: int | None) -> None:
+    """Run a model to its end, or to the end of some time steps."""
+    from petsc_fs.porepy.models import StopRun, run
+
+    def limited(model: Any) -> Floats:
+        if time_steps is not None and model.time_manager.time_index > time_steps:
+            raise StopRun
+        return advance(model)
+
+    run(model, linear_solve=limited)
+
+
+def _folder(path: Path) -> Path:
+    """A folder, made if it is missing."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise SceneError(f"{path}: cannot be made a directory: {e.strerror}") from e
+    return path
 
 
 def export_bundled(
@@ -232,20 +358,55 @@ def export_bundled(
     return made
 
 
+def export_bundled_sequences(directory: str | os.PathLike[str], progress: Progress | None = None) -> list[Path]:
+    """Make the sequences that come with the package, `NAME.h5`, by `FieldSplitSolver` on one rank.
+
+    Args:
+        directory: where the files go; made if missing.
+        progress: see `export`.
+
+    Raises:
+        PetscFsError: see `export`.
+    """
+    return [
+        export_sequence(
+            model,
+            Path(directory) / f"{name}.h5",
+            parameters=ModelParameters(refinement=refinement),
+            time_steps=time_steps,
+            solver="fieldsplit",
+            progress=progress,
+        )
+        for name, (model, refinement, time_steps) in BUNDLED_SEQUENCES.items()
+    ]
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `command`; needs no PorePy."""
     parser.add_argument("model", choices=list(CASES), help="name of the model")
+    add_model_arguments(parser)
+    parser.add_argument(
+        "--out", dest="directory", metavar="DIR", help="where the scenes go; with --sequence, folder or file (.h5)"
+    )
+    parser.add_argument(
+        "--steps",
+        help='Newton steps to write: TIME:NEWTON such as "1:3,2:0" (times from 1, Newton steps from 0), '
+        '"mixed" (the first with sticking, sliding and open cells; "mixed@3": from time step 3 on), '
+        '"last" (default) or "all"',
+    )
+    parser.add_argument("--sequence", action="store_true", help="write all Newton steps into one file, for replay")
+    parser.add_argument("--reference", action="store_true", help="store an accurate solution too")
+    parser.add_argument(
+        "--solver", choices=SOLVERS, default="direct", help="for the steps on the way; direct is for small models"
+    )
+
+
+def add_model_arguments(parser: argparse.ArgumentParser) -> None:
+    """Describe what can be varied in a model, for `parameters_of`, and `--time-steps`; needs no PorePy."""
     parser.add_argument(
         "--refine", dest="refinement", type=float, default=1.0, metavar="G", help="cells are 100 m / G wide"
     )
-    parser.add_argument("--out", dest="directory", default=".", metavar="DIR", help="where the scenes go")
-    parser.add_argument(
-        "--steps",
-        default="last",
-        help='Newton steps to write: TIME:NEWTON such as "1:3,2:0" (times from 1, Newton steps from 0), '
-        '"mixed" (the first with sticking, sliding and open cells; "mixed@3": from time step 3 on), '
-        '"last" or "all"',
-    )
+    parser.add_argument("--time-steps", type=_positive, metavar="N", help="end the run after N time steps")
     parser.add_argument("--friction", type=float, default=0.577, metavar="F", help="Coulomb coefficient")
     parser.add_argument(
         "--normal-stiffness",
@@ -262,7 +423,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--physics", choices=PHYSICS, default="full", help="restricted: linear fluid mass")
     parser.add_argument("--fracture-permeability", choices=FRACTURE_PERMEABILITY, help="if not the model's own")
-    parser.add_argument("--reference", action="store_true", help="store an accurate solution too")
+
+
+def _positive(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number from 1 on, found {text!r}")
+    return int(text)
+
+
+def parameters_of(args: argparse.Namespace) -> ModelParameters:
+    """What the arguments of `add_model_arguments` say.
+
+    Raises:
+        UsageError: a value is outside its range.
+    """
+    return ModelParameters(
+        refinement=args.refinement,
+        friction=args.friction,
+        normal_stiffness=args.normal_stiffness,
+        pressure_ratio=args.pressure_ratio,
+        physics=args.physics,
+        fracture_permeability=args.fracture_permeability,
+    )
 
 
 def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
@@ -273,23 +455,36 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
     """
     if comm.size > 1:
         raise UsageError("export runs on one rank, as PorePy does; start it without mpiexec")
-    parameters = ModelParameters(
-        refinement=args.refinement,
-        friction=args.friction,
-        normal_stiffness=args.normal_stiffness,
-        pressure_ratio=args.pressure_ratio,
-        physics=args.physics,
-        fracture_permeability=args.fracture_permeability,
-    )
+    parameters = parameters_of(args)
+    if args.sequence:
+        if args.steps is not None or args.reference:
+            raise UsageError("--sequence writes every Newton step, without reference solutions; --time-steps ends it")
+        export_sequence(
+            args.model,
+            _sequence_path(args.directory or ".", f"{args.model}_g{parameters.refinement:g}"),
+            parameters=parameters,
+            time_steps=args.time_steps,
+            solver=args.solver,
+            progress=write_to_stderr,
+        )
+        return 0
     export(
         args.model,
-        directory=args.directory,
-        steps=args.steps,
+        directory=args.directory or ".",
+        steps=args.steps or "last",
         parameters=parameters,
+        time_steps=args.time_steps,
         reference=args.reference,
+        solver=args.solver,
         progress=write_to_stderr,
     )
     return 0
+
+
+def _sequence_path(out: str, name: str) -> Path:
+    """The file itself if it has a suffix, else one in this folder."""
+    path = Path(out)
+    return path if path.suffix and not path.is_dir() else path / f"{name}_sequence.h5"
 
 
 def write_to_stderr(line: str) -> None:

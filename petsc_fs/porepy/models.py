@@ -100,6 +100,35 @@ class NoFiles(pp.SolutionStrategy):
             super().set_geometry()
 
 
+class VtuExport(pp.SolutionStrategy):
+    """Write the state after each time step for ParaView, by PorePy's exporter; undoes `NoFiles`.
+
+    In SI units, with the contact state of each fracture cell. The parameters `folder_name` and `file_name` say where.
+    """
+
+    def initialize_data_saving(self) -> None:
+        """Make the exporter."""
+        self.exporter = pp.Exporter(
+            self.mdg, self.params["file_name"], folder_name=self.params["folder_name"], length_scale=self.units.m
+        )
+
+    def save_data_time_step(self) -> None:
+        """Write one file per grid dimension, and the list of times."""
+        self.exporter.write_vtu(self.data_to_export(), time_dependent=True)
+        self.time_manager.exported_times.append(self.time_manager.time)
+        self.exporter.write_pvd(times=np.array(self.time_manager.exported_times))
+
+    def data_to_export(self) -> list[Any]:
+        """Data per grid, as PorePy's exporter takes them."""
+        data: list[Any] = super().data_to_export()
+        if hasattr(self, "contact_traction_variable"):
+            from petsc_fs.porepy.adapter import contact_state
+
+            fractures = self.mdg.subdomains(dim=self.nd - 1)
+            data += [(sd, "contact_state", contact_state(self, [sd])) for sd in fractures]
+        return data
+
+
 class CaseGeometry(pp.ModelGeometry):
     """Square or cube with the fractures of the case."""
 

@@ -1,0 +1,452 @@
+"""Run a model with `FieldSplitSolver`: rank 0 runs PorePy, all ranks solve its linear systems.
+
+PorePy is imported when a run starts, not when this module is: the command line can describe the
+arguments without it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from petsc_fs import cli, options
+from petsc_fs.errors import PetscFsError, SolveError, UsageError, together
+from petsc_fs.files import write_text
+from petsc_fs.porepy import require_porepy
+from petsc_fs.porepy.cases import CASES, ModelParameters
+from petsc_fs.porepy.export import add_model_arguments, parameters_of, run_attributes
+from petsc_fs.porepy.observation import PHASES, Observed, Observer
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from petsc_fs.sequence import Writer
+
+Floats = NDArray[np.float64]
+
+RECORDS, SUMMARY, PICTURE, SEQUENCE, VTU = "solves.jsonl", "summary.json", "contact_states", "sequence.h5", "vtu"
+"""Names of what a run writes."""
+
+SECONDS_BETWEEN_PICTURES = 30.0
+"""The picture is drawn after the first time step, and again after a later one when so much time has gone by."""
+
+PICTURES = ("png", "svg", "pdf", "none")
+
+EPILOG = """\
+MODEL is one of {models}, or one of yours:
+path/to/file.py:Class or package.module:Class, any PorePy model made of contact mechanics, momentum
+balance and single-phase flow. FieldSplitSolver is put before its bases where it is not among them.
+Where the file has dictionaries named model_params and solver_params, as in PorePy's tutorials, the
+model and PorePy's nonlinear solver get these.
+
+PETSc options follow, for example
+  -options_file FILE     an options file of yours, or the name of a shipped one; default is the
+                         smallest solver for the model
+  -ksp_rtol 1e-6         relative tolerance
+  -petsc_fs_on_failure accept|retry|raise        what becomes of a solve that misses its tolerance
+  -petsc_fs_forcing fixed|eisenstat_walker       exact or inexact Newton
+
+Written to DIR: solves.jsonl, one record per linear solve as soon as its Newton step is done;
+contact_states.png; summary.json; and, if asked for, sequence.h5 and vtu/.
+
+exit codes: 0 the run went to its end; 1 Newton or a linear solve failed; 2 wrong call or option;
+130 interrupted by Ctrl-C. What there is by then is kept, a sequence as sequence.partial.h5."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `command`; needs no PorePy."""
+    parser.epilog = EPILOG.format(models=", ".join(CASES))
+    parser.add_argument("model", metavar="MODEL", help="name of a model, or FILE.py:CLASS")
+    add_model_arguments(parser)
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where results go; default MODEL_run")
+    parser.add_argument("--picture", choices=PICTURES, default="png", help="format of the picture of contact states")
+    parser.add_argument("--vtu", action="store_true", help="write the states for ParaView, by PorePy's exporter")
+    parser.add_argument("--sequence", action="store_true", help="write all linear systems, for petsc-fs solve")
+
+
+def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
+    """Run what the arguments of `add_arguments` ask for; progress goes to stderr. Collective.
+
+    Raises:
+        UsageError: PorePy is missing, there is no such model or parameter, or an option did nothing.
+        SolveError: Newton did not converge, or a linear solve failed.
+        KeyboardInterrupt: the run was interrupted; the message says what it has left.
+    """
+    with together(comm):
+        parameters = parameters_of(args)
+        is_case = args.model in CASES
+        if not is_case:
+            _split_name(args.model)
+            if parameters.changes():
+                raise UsageError(f"{args.model}: {parameters.changes()}: only the models of this package take these")
+        folder = args.out or Path(f"{args.model if is_case else args.model.rpartition(':')[2]}_run")
+        petsc, file = _without_options_file(petsc)
+        if comm.rank == 0:
+            require_porepy()
+            _make_folder(folder)
+    given = cli.GivenOptions.start_petsc(petsc, file)
+    outcome = None
+    error: BaseException | None = None
+    with _terminate_as_interrupt(comm.rank):
+        client = _start_server(comm)
+        if comm.rank == 0:
+            try:
+                outcome = _Run(args, parameters, folder, given, comm.size).go()
+            except BaseException as e:
+                error = e
+            finally:
+                if client is not None:
+                    client.stop()
+        _raise_together(error, comm)
+    if outcome is not None:
+        from petsc_fs.tables import run_table
+
+        print(run_table(outcome), flush=True)
+    return 0
+
+
+@contextmanager
+def _terminate_as_interrupt(rank: int) -> Iterator[None]:
+    """Take a request to terminate for an interrupt: some MPI launchers send one for the other.
+
+    Only rank 0 listens; it tells the other ranks. Local.
+    """
+
+    def interrupt(number: int, frame: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    before = signal.signal(signal.SIGTERM, interrupt if rank == 0 else signal.SIG_IGN)
+    before_interrupt = signal.getsignal(signal.SIGINT)
+    if rank > 0:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before if before is not None else signal.SIG_DFL)
+        signal.signal(signal.SIGINT, before_interrupt if before_interrupt is not None else signal.default_int_handler)
+
+
+def _start_server(comm: MPI.Intracomm) -> Any:
+    """Let the other ranks serve this one; they come back when it says stop. Collective."""
+    if comm.size == 1:
+        return None
+    from petsc_fs import server
+
+    return server.start(comm)
+
+
+def _raise_together(error: BaseException | None, comm: MPI.Intracomm) -> None:
+    """Raise the error of rank 0 on all ranks. Collective."""
+    kind = None
+    if error is not None:
+        kind = "interrupt" if isinstance(error, KeyboardInterrupt) else "error"
+    kind, text = comm.bcast((kind, str(error)))
+    if kind == "interrupt":
+        raise error if error is not None else KeyboardInterrupt(text)
+    if kind == "error":
+        own = comm.bcast(error if isinstance(error, PetscFsError) else None)
+        raise error or own or RuntimeError(text)
+
+
+class _Run:
+    """One run on rank 0, and what it leaves in its folder."""
+
+    def __init__(
+        self, args: argparse.Namespace, parameters: ModelParameters, folder: Path, given: cli.GivenOptions, ranks: int
+    ) -> None:
+        from petsc_fs.porepy.display import display_for
+
+        self.args = args
+        self.parameters = parameters
+        self.folder = folder
+        self.given = given
+        self.ranks = ranks
+        self.files: list[str] = [RECORDS]
+        self.notes: list[str] = []
+        self.name = args.model
+        self.display = display_for(args.model)
+        self.writer: Writer | None = None
+        self._drawn = -math.inf
+        self.model: Any = None
+        for name in (RECORDS, SUMMARY, SEQUENCE, *(f"{PICTURE}.{suffix}" for suffix in PICTURES[:-1])):
+            (folder / name).unlink(missing_ok=True)  # of an earlier run
+        self.observer = Observer(
+            folder / RECORDS,
+            time_steps=args.time_steps,
+            on_record=self.display.show,
+            on_time_step=self._end_time_step,
+            on_solve=self._solve,
+        )
+
+    def go(self) -> dict[str, Any]:
+        """Run to the end, and write everything; what is in the summary."""
+        result = "finished"
+        error: BaseException | None = None
+        try:
+            with self.display:
+                self._simulate()
+        except KeyboardInterrupt as e:
+            result, error = "interrupted", e
+        except BaseException as e:
+            result, error = "failed", e
+            raise
+        finally:
+            self.observer.close()
+            summary = self._finish(result, error)
+        if error is not None:
+            kept = f"{len(self.observer.records)} solves in {summary['time_steps']} complete time steps"
+            raise KeyboardInterrupt(f"interrupted; {self.folder} keeps {kept}") from error
+        return summary
+
+    def _simulate(self) -> None:
+        runner: Callable[[], None]
+        self.model, runner = _prepare_model(self.args.model, self.parameters, self.folder, self.args.vtu)
+        self.name = getattr(self.model, "scene_name", type(self.model).__name__)
+        self.model.observer = self.observer
+        if self.given.file is not None:
+            self.model.params["petsc_fs_options_file"] = str(self.given.file)
+        if self.args.sequence:
+            from petsc_fs import sequence
+
+            self.writer = sequence.Writer(self.folder / SEQUENCE, model=self.name)
+        self.display.begin(_expected_time_steps(self.model, self.args.time_steps))
+        runner()
+
+    def _solve(self, model: Any, solve: Callable[[], Floats]) -> Floats:
+        scene = None
+        if self.writer is not None:
+            from petsc_fs.porepy.adapter import scene_from_model
+
+            scene = scene_from_model(model)
+        update = solve()
+        if not self.observer.records:
+            self.given.refuse_unused()
+        if self.writer is not None and scene is not None:
+            with self.observer.phase("output"):
+                self.writer.append(scene, run_attributes(model))
+        return update
+
+    def _end_time_step(self, number: int) -> None:
+        self.display.advance(number)
+        if time.monotonic() - self._drawn > SECONDS_BETWEEN_PICTURES:
+            with self.observer.phase("output"):
+                self._draw()
+
+    def _finish(self, result: str, error: BaseException | None) -> dict[str, Any]:
+        """Complete the sequence, draw the picture and write the summary; none of it hides an error of the run."""
+        try:
+            if self.writer is not None:
+                self._finish_sequence(result)
+            if self.args.vtu and (self.folder / VTU).is_dir():
+                self.files.append(VTU)
+            if result != "interrupted":  # then there may be no time: MPI launchers kill after a second
+                self._draw()
+            summary = self._summary(result, error)
+            write_text(self.folder / SUMMARY, json.dumps(summary, indent=2) + "\n")
+        except PetscFsError:
+            if error is None:
+                raise
+            summary = self._summary(result, error)
+        return summary
+
+    def _finish_sequence(self, result: str) -> None:
+        assert self.writer is not None
+        kept = self.writer.finish() if result == "finished" else self.writer.abandon()
+        if kept is not None:
+            self.files.append(kept.name)
+
+    def _draw(self) -> None:
+        """Draw the contact states so far, if there are any."""
+        from petsc_fs.plot import plot_contact_states
+
+        self._drawn = time.monotonic()
+        if self.args.picture == "none" or self.notes or not any(r["contact_states"] for r in self.observer.records):
+            return
+        target = self.folder / f"{PICTURE}.{self.args.picture}"
+        try:
+            plot_contact_states(self.observer.records, target, title=self.name, cells=_fracture_cells(self.model))
+            if target.name not in self.files:
+                self.files.append(target.name)
+        except UsageError as e:  # no matplotlib
+            self.notes.append(f"no picture of the contact states: {e}")
+
+    def _summary(self, result: str, error: BaseException | None) -> dict[str, Any]:
+        observer, records = self.observer, self.observer.records
+        total = observer.total_seconds
+        seconds = {name: observer.seconds[name] for name in PHASES}
+        porepy = require_porepy()
+        return {
+            "model": self.name,
+            "result": result,
+            "message": None if error is None else str(error) or type(error).__name__,
+            "ranks": self.ranks,
+            "unknowns": records[-1]["unknowns"] if records else None,
+            "time_steps": observer.time_steps,
+            "time_step_cuts": observer.cuts,
+            "newton_steps": len(records),
+            "iterations": sum(r["iterations"] for r in records),
+            "not_converged": sum(not r["converged"] for r in records),
+            "contact_states": records[-1]["contact_states"] if records else {},
+            "seconds": {**seconds, "other": max(total - sum(seconds.values()), 0.0), "total": total},
+            "folder": str(self.folder),
+            "files": [*self.files, SUMMARY],
+            "notes": self.notes,
+            "options_file": None if self.given.file is None else self.given.file.name,
+            "options": cli.database(),
+            "versions": {**cli.versions(), "porepy": str(porepy.__version__)},
+        }
+
+
+def _prepare_model(name: str, parameters: ModelParameters, folder: Path, vtu: bool) -> tuple[Any, Callable[[], None]]:
+    """The model, with the mixins it needs, and what runs it."""
+    from petsc_fs.porepy import models
+    from petsc_fs.porepy.solver import FieldSplitSolver
+
+    if name in CASES:
+        mixins: tuple[type, ...] = (
+            (Observed, models.VtuExport, FieldSplitSolver) if vtu else (Observed, FieldSplitSolver)
+        )
+        model = models.make_model(name, parameters, mixins=mixins)
+        model.params |= {"folder_name": str(folder / VTU), "file_name": name}
+        model.stop = models.StopRun
+        return model, lambda: models.run(model)
+    module, cls = _load(name)
+    bases = (Observed, cls) if issubclass(cls, FieldSplitSolver) else (Observed, FieldSplitSolver, cls)
+    export: dict[str, Any] = {"folder_name": str(folder / VTU)} if vtu else {"times_to_export": []}
+    model = type(cls.__name__, bases, {})(_dictionary(module, "model_params") | export)
+    model.stop = models.StopRun
+    return model, lambda: _run_own(model, _dictionary(module, "solver_params"))
+
+
+def _fracture_cells(model: Any) -> tuple[Floats, NDArray[np.int8]]:
+    """Centres of the fracture cells in m, and their contact states at the current iterate."""
+    from petsc_fs.porepy.adapter import Adapter, contact_state
+
+    fractures = Adapter(model).grids("contact")
+    centers = np.concatenate([sd.cell_centers.T for sd in fractures]) * float(model.units.m)
+    return centers, contact_state(model, fractures)
+
+
+def _run_own(model: Any, settings: dict[str, Any]) -> None:
+    """Run a model of the user's as PorePy does.
+
+    Raises:
+        SolveError: Newton did not converge.
+    """
+    from petsc_fs.porepy.models import StopRun
+
+    pp = require_porepy()
+    timed = model._is_time_dependent()
+    try:
+        (pp.run_time_dependent_model if timed else pp.run_stationary_model)(model, settings)
+    except StopRun:
+        pass
+    except ValueError as e:
+        if "onverge" not in str(e):
+            raise
+        step = f"time step {model.time_manager.time_index}"
+        raise SolveError(f"{type(model).__name__}: Newton did not converge in {step}: {e}") from e
+
+
+def _split_name(name: str) -> tuple[str, str]:
+    """File or module, and class.
+
+    Raises:
+        UsageError: there is no class, or no such file.
+    """
+    where, colon, cls = name.rpartition(":")
+    if not (colon and where and cls.isidentifier()):
+        raise UsageError(f"unknown model {name!r}; models are {', '.join(CASES)}, or FILE.py:CLASS or MODULE:CLASS")
+    if where.endswith(".py") and not Path(where).is_file():
+        raise UsageError(f"{where}: no such file")
+    return where, cls
+
+
+def _load(name: str) -> tuple[Any, type]:
+    """Module and class of a model of the user's.
+
+    Raises:
+        UsageError: the module cannot be imported, or has no such class.
+    """
+    where, class_name = _split_name(name)
+    if where.endswith(".py"):
+        spec = spec_from_file_location(Path(where).stem, where)
+        assert spec is not None and spec.loader is not None
+        module = sys.modules[spec.name] = module_from_spec(spec)
+        sys.path.insert(0, str(Path(where).resolve().parent))  # as Python does for a script
+        spec.loader.exec_module(module)
+    else:
+        try:
+            module = import_module(where)
+        except ModuleNotFoundError as e:
+            raise UsageError(f"{name}: {e}") from e
+    found = getattr(module, class_name, None)
+    if not (isinstance(found, type) and hasattr(found, "prepare_simulation")):
+        raise UsageError(f"{where} has no PorePy model of the name {class_name}")
+    return module, found
+
+
+def _dictionary(module: Any, name: str) -> dict[str, Any]:
+    """A dictionary of a module, copied; empty if there is none."""
+    found = getattr(module, name, {})
+    if not isinstance(found, dict):
+        raise UsageError(f"{module.__name__}.{name}: expected a dictionary, found {type(found).__name__}")
+    return dict(found)
+
+
+def _expected_time_steps(model: Any, limit: int | None) -> int:
+    """How many time steps there will be if none is cut."""
+    manager = model.time_manager
+    whole = max(round(float(manager.schedule[-1] - manager.schedule[0]) / float(manager.dt)), 1)
+    return whole if limit is None else min(whole, limit)
+
+
+def _without_options_file(petsc: list[str]) -> tuple[list[str], Path | None]:
+    """PETSc's arguments without the options file, which goes to the model instead.
+
+    Raises:
+        UsageError: the file cannot be read, or there are two.
+    """
+    rest: list[str] = []
+    file: Path | None = None
+    words = iter(petsc)
+    for word in words:
+        if word != "-options_file":
+            rest.append(word)
+            continue
+        if file is not None:
+            raise UsageError("-options_file: a run takes one")
+        name = next(words, None)
+        if name is None:
+            raise UsageError("-options_file: the name of the file is missing")
+        file = options.find_options_file(name)
+        options.parse(file)
+    return rest, file
+
+
+def _make_folder(folder: Path) -> None:
+    """The folder of results, made if it is missing.
+
+    Raises:
+        UsageError: it cannot be written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / ".petsc_fs"
+        probe.touch()
+        probe.unlink()
+    except OSError as e:
+        raise UsageError(f"{folder}: cannot be written to: {e.strerror}") from e
