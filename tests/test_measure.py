@@ -1,0 +1,351 @@
+"""Outcomes of measured processes, references and error norms."""
+
+import os
+import time
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from petsc_fs import accuracy, hdf5, reference
+from petsc_fs.errors import LayoutError, SceneError, SolveError
+from petsc_fs.measure import KINDS, Job, measure
+from petsc_fs.scene import Scene
+from tests.sample import SCENES, csr, dense
+
+BIOT = str(SCENES / "biot.h5")
+
+
+def scene_of(matrix: np.ndarray, rhs: np.ndarray, sizes: dict[str, int], **known: object) -> Scene:
+    return Scene.from_matrix(Dense(matrix), rhs, ranges(sizes), dimension=2, **known)
+
+
+class Dense:
+    """What `Scene.from_matrix` takes."""
+
+    def __init__(self, matrix: np.ndarray) -> None:
+        self.indptr, self.indices, self.data = csr(matrix)
+
+
+def ranges(sizes: dict[str, int]) -> dict[str, range]:
+    ends = np.cumsum(list(sizes.values()))
+    return {f: range(end - n, end) for (f, n), end in zip(sizes.items(), ends, strict=True)}
+
+
+# --- norms
+
+
+def test_norm_is_weighted_by_volume() -> None:
+    scene = scene_of(np.eye(4), np.ones(4), {"momentum": 4}, cell_volumes={"momentum": np.array([3.0, 1.0])})
+    ruler = accuracy.Ruler(scene, {"momentum": np.array([1.0, 0.0, 2.0, 0.0])})  # Σ V x² / Σ V = (3·1 + 1·4) / 4
+    assert ruler.scale["momentum"] == pytest.approx(np.sqrt(7 / 4), rel=1e-15)
+    found = ruler.errors({"momentum": np.array([1.0, 0.5, 2.0, 0.0])})  # Σ V e² / Σ V = 3 · 0.25 / 4
+    assert found.by_field["momentum"] == pytest.approx(np.sqrt((3 * 0.25 / 4) / (7 / 4)), rel=1e-15)
+    assert found.total == found.by_field["momentum"]
+
+
+def test_each_dimension_counts_alike_whatever_the_unit_of_length() -> None:
+    def error(length: float) -> float:
+        volumes = np.array([2 * length**2, 2 * length**2, length])
+        scene = scene_of(
+            np.eye(3), np.ones(3), {"mass": 3}, cell_volumes={"mass": volumes}, cell_dimension=np.array([2, 2, 1])
+        )
+        return accuracy.Ruler(scene, {"mass": np.array([1.0, 1.0, 1.0])}).errors({"mass": np.array([1, 1, 3.0])}).total
+
+    assert error(1.0) == pytest.approx(np.sqrt(4 / 2))  # mean squares: (0 + 4) of the error, (1 + 1) of the reference
+    assert error(1e3) == pytest.approx(error(1.0), rel=1e-14)
+
+
+def test_fluxes_are_measured_by_their_density() -> None:
+    scene = scene_of(np.eye(2), np.ones(2), {"intf_flow": 2}, cell_volumes={"intf_flow": np.array([4.0, 1.0])})
+    ruler = accuracy.Ruler(scene, {"intf_flow": np.array([2.0, 0.0])})
+    assert ruler.scale["intf_flow"] == 1.0  # 2² / 4
+    assert ruler.errors({"intf_flow": np.array([2.0, 3.0])}).total == 3.0  # 3² / 1
+
+
+def test_without_volumes_norms_are_euclidean_and_fields_count_alike() -> None:
+    scene = scene_of(np.eye(4), np.ones(4), {"momentum": 2, "mass": 2})
+    ruler = accuracy.Ruler(scene, {"momentum": np.array([3.0, 4.0]), "mass": np.array([1e6, 0.0])})
+    found = ruler.errors({"momentum": np.array([3.0, 5.0]), "mass": np.array([1.1e6, 0.0])})
+    assert found.by_field == pytest.approx({"momentum": 0.2, "mass": 0.1})
+    assert found.total == pytest.approx(np.sqrt((0.2**2 + 0.1**2) / 2))
+
+
+def test_error_is_absolute_and_left_out_of_the_total_where_the_reference_is_zero() -> None:
+    scene = scene_of(np.eye(3), np.ones(3), {"momentum": 2, "mass": 1})
+    ruler = accuracy.Ruler(scene, {"momentum": np.zeros(2), "mass": np.array([4.0])})
+    found = ruler.errors({"momentum": np.array([0.0, 7.0]), "mass": np.array([5.0])})
+    assert found.by_field == {"momentum": 7.0, "mass": 0.25}
+    assert found.total == 0.25
+
+
+def test_reference_of_another_scene_is_refused() -> None:
+    scene = scene_of(np.eye(2), np.ones(2), {"mass": 2})
+    with pytest.raises(LayoutError, match="mass"):
+        accuracy.Ruler(scene, {"mass": np.zeros(3)})
+
+
+def test_backward_errors_by_hand() -> None:
+    scene = scene_of(np.array([[2.0, -1.0], [0.0, 4.0]]), np.array([1.0, 8.0]), {"mass": 2})
+    x = {"mass": np.array([1.0, 2.5])}  # residual 1 - (2 - 2.5) = 1.5 and 8 - 10 = -2
+    found = accuracy.backward_error(scene, x)
+    assert found["componentwise"] == pytest.approx(max(1.5 / (2 + 2.5 + 1), 2 / (10 + 8)))
+    assert found["normwise"] == pytest.approx(2 / (4 * 2.5 + 8))
+    assert accuracy.backward_error(scene, {"mass": np.array([1.5, 2.0])}) == {"normwise": 0.0, "componentwise": 0.0}
+
+
+def test_componentwise_backward_error_does_not_see_scaling() -> None:
+    A, b, x = np.array([[2.0, -1.0], [3.0, 4.0]]), np.array([1.0, 8.0]), np.array([1.0, 2.5])
+    r, c = np.array([1024.0, 0.5]), np.array([2.0**-20, 8.0])
+    plain, scaled = (
+        accuracy.backward_error(scene_of(m, v, {"mass": 2}), {"mass": y})["componentwise"]
+        for m, v, y in ((A, b, x), (r[:, None] * A * c, r * b, x / c))
+    )
+    assert plain == scaled
+
+
+# --- references
+
+
+def exact_solution(A: np.ndarray, b: np.ndarray) -> list[Fraction]:
+    """Gauss elimination in rational numbers."""
+    rows = [[Fraction(float(v)) for v in row] + [Fraction(float(w))] for row, w in zip(A, b, strict=True)]
+    n = len(rows)
+    for k in range(n):
+        pivot = next(i for i in range(k, n) if rows[i][k])
+        rows[k], rows[pivot] = rows[pivot], rows[k]
+        rows[k] = [v / rows[k][k] for v in rows[k]]
+        for i in range(n):
+            if i != k and rows[i][k]:
+                rows[i] = [v - rows[i][k] * w for v, w in zip(rows[i], rows[k], strict=True)]
+    return [row[n] for row in rows]
+
+
+def hilbert(n: int) -> np.ndarray:
+    return 1.0 / (np.arange(n)[:, None] + np.arange(n) + 1)
+
+
+def test_residual_has_twice_the_digits() -> None:
+    rng = np.random.default_rng(1)
+    A = hilbert(7) * (rng.random((7, 7)) < 0.7)
+    b, x, y = rng.random(7), rng.random(7), 1e-17 * rng.random(7)
+    high, low = reference.ExactResidual(csr(A), b)(x, y)
+    for i in range(7):
+        terms = [Fraction(A[i, j]) * (Fraction(x[j]) + Fraction(y[j])) for j in range(7)]
+        error = abs(Fraction(high[i]) + Fraction(low[i]) - (Fraction(b[i]) - sum(terms)))
+        assert error <= Fraction(1, 10**30) * (Fraction(b[i]) + sum(terms))
+
+
+def mumps_alone(A: np.ndarray, b: np.ndarray) -> np.ndarray:
+    from petsc4py import PETSc
+
+    indptr, indices, data = csr(A)
+    integers = (indptr.astype(PETSc.IntType), indices.astype(PETSc.IntType))
+    J = PETSc.Mat().createAIJ(A.shape, csr=(*integers, data), comm=PETSc.COMM_SELF)
+    pc = PETSc.PC().create(PETSc.COMM_SELF)
+    pc.setType("lu")
+    pc.setFactorSolverType("mumps")
+    pc.setOperators(J)
+    x, y = J.createVecs()
+    y.setArray(b)
+    pc.apply(y, x)
+    return x.getArray().copy()
+
+
+def test_reference_is_exact_to_the_last_digit_where_mumps_alone_is_not() -> None:
+    n = 9  # condition number 5e11
+    A = np.diag(10.0 ** np.arange(n)) @ hilbert(n) @ np.diag(10.0 ** -np.arange(n))
+    b = np.ones(n)
+    exact = exact_solution(A, b)
+
+    def error(x: np.ndarray) -> float:
+        return max(float(abs(Fraction(v) - e) / abs(e)) for v, e in zip(x, exact, strict=True))
+
+    found = reference.solve(scene_of(A, b, {"mass": n}), "direct")
+    assert error(found.solution["mass"]) <= 2.0**-52
+    assert error(mumps_alone(A, b)) > 1e-8
+    assert found.corrections[-1] < reference.ENOUGH
+    assert found.backward_error["componentwise"] <= 2.0**-52
+    assert found.unrounded_backward_error < 1e-25
+    assert "mumps" in found.method
+
+
+def test_both_methods_agree_and_beat_the_stored_reference(tmp_path: Path) -> None:
+    scene = hdf5.read(SCENES / "model2.h5")
+    direct, iterative = (reference.solve(scene, method) for method in ("direct", "iterative"))
+    for f, x in direct.solution.items():
+        np.testing.assert_allclose(iterative.solution[f], x, rtol=4e-16, atol=0.0, err_msg=f)
+    assert "Krylov" in iterative.method
+    stored = accuracy.backward_error(scene, scene.reference)["componentwise"]
+    assert direct.backward_error["componentwise"] < stored
+    reference.write(direct, tmp_path / "x.npz")
+    again = reference.read(tmp_path / "x.npz")
+    assert again.about() == direct.about()
+    assert all(np.array_equal(again.solution[f], x) for f, x in direct.solution.items())
+
+
+def test_no_reference_for_a_singular_matrix() -> None:
+    with pytest.raises(SolveError, match="no reference"):
+        reference.solve(scene_of(np.array([[1.0, 1.0], [1.0, 1.0]]), np.array([1.0, 2.0]), {"mass": 2}), "direct")
+    with pytest.raises(SolveError, match="zeros"):
+        reference.solve(scene_of(np.array([[1.0, 0.0], [1.0, 0.0]]), np.ones(2), {"mass": 2}), "direct")
+
+
+def test_damaged_reference_file(tmp_path: Path) -> None:
+    (tmp_path / "x.npz").write_text("no")
+    with pytest.raises(SceneError, match="compute it anew"):
+        reference.read(tmp_path / "x.npz")
+
+
+def test_one_block_is_the_whole_matrix() -> None:
+    scene = hdf5.read(SCENES / "flow.h5")
+    block = reference.one_block(scene)
+    whole = np.zeros((block.indptr.size - 1,) * 2)
+    whole[np.repeat(np.arange(len(whole)), np.diff(block.indptr)), block.indices] = block.data
+    np.testing.assert_array_equal(whole, dense(scene))
+
+
+# --- outcomes
+
+
+@pytest.fixture
+def bad_pc(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Module with Python PCs that misbehave when they are set up."""
+    (tmp_path / "bad_pc.py").write_text(
+        "import os, time\n"
+        "class Crash:\n    def setUp(self, pc): os.abort()\n"
+        "class Exit:\n    def setUp(self, pc): print('ERROR: giving up', flush=True); os._exit(3)\n"
+        "class Hang:\n    def setUp(self, pc): time.sleep(1000)\n"
+        "class Greedy:\n    def setUp(self, pc): self.much = bytearray(2**34)\n"
+        "from petsc_fs.errors import SolveError\n"
+        "class Lonely:\n    def setUp(self, pc):\n"
+        "        if pc.comm.rank: raise SolveError('only here')\n"
+        "        pc.comm.tompi4py().Barrier()\n"
+        "class Wrong:\n    def apply(self, pc, x, y): x.copy(y); y.scale(float('nan'))\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    return "bad_pc"
+
+
+def outcome(options: dict[str, str | None], **more: object) -> dict[str, object]:
+    base = {"scenes": [BIOT], "options_file": "poromechanics.opts", "options": options, "time_limit": 60.0}
+    records = measure(Job(**(base | more)))  # type: ignore[arg-type]
+    assert all(set(r) >= {"scene", "rtol", "repetition", "kind", "message", "phase", "iterations"} for r in records)
+    assert all(r["kind"] in KINDS for r in records)
+    return records[-1]
+
+
+def python(name: str) -> dict[str, str | None]:
+    return {"ksp_type": "gmres", "pc_type": "python", "pc_python_type": f"bad_pc.{name}"}
+
+
+def test_converged() -> None:
+    found = outcome({})
+    assert (found["kind"], found["message"], found["rtol"]) == ("converged", "", None)
+    assert found["true_residual"] <= 1e-10 and found["reason"] == "CONVERGED_RTOL"
+    assert found["peak_rss"][0] >= found["base_rss"][0] > 0
+    assert found["forward_error"] is None and found["backward_error"] is None and found["history"] is None
+
+
+def test_tolerances_repetitions_errors_and_history_on_two_ranks(tmp_path: Path) -> None:
+    reference.write(reference.solve(hdf5.read(BIOT)), tmp_path / "x.npz")
+    job = Job(
+        scenes=[BIOT],
+        ranks=2,
+        rtols=(1e-2, 1e-8),
+        repetitions=2,
+        warm_up=True,
+        errors=True,
+        history=True,
+        references={BIOT: tmp_path / "x.npz"},
+    )
+    records = measure(Job.from_json(job.to_json()))
+    assert [(r["repetition"], r["rtol"], r["kind"]) for r in records] == [
+        (i, rtol, "converged") for i in (0, 1) for rtol in (1e-2, 1e-8)
+    ]
+    for record in records:
+        assert record["true_residual"] <= record["rtol"] and len(record["peak_rss"]) == 2
+        squares = [v**2 for v in record["residual_by_field"].values()]
+        assert record["true_residual"] == pytest.approx(np.sqrt(sum(squares)))
+        assert 0 < record["backward_error"]["normwise"] and record["setup_seconds"] > 0
+    assert records[1]["forward_error"] < 1e-3 * records[0]["forward_error"]
+    assert [r["history"] is not None for r in records] == [False, False, False, True]
+    history, last = records[3]["history"], records[3]
+    assert len(history["seconds"]) == last["iterations"] + 1 == len(history["residual"])
+    assert all(np.diff(history["seconds"]) > 0) and 0 <= history["seconds"][0]
+    assert history["residual"][0] == pytest.approx(1.0) and history["forward_error"][0] == pytest.approx(1.0)
+    assert history["residual"][-1] == pytest.approx(last["true_residual"], rel=1e-6)
+    assert history["forward_error"][-1] == pytest.approx(last["forward_error"], rel=1e-6)
+    assert history["error_by_field"]["mass"][-1] == pytest.approx(last["error_by_field"]["mass"], rel=1e-6)
+
+
+def test_stagnated() -> None:
+    found = outcome({"ksp_max_it": "2", "petsc_fs_restarts": "0"})
+    assert (found["kind"], found["iterations"]) == ("stagnated", 2)
+
+
+def test_diverged(bad_pc: str, tmp_path: Path) -> None:
+    wild = tmp_path / "wild.opts"
+    wild.write_text("-ksp_type richardson\n-ksp_richardson_scale -30\n-ksp_divtol 1e3\n-pc_type jacobi\n")
+    found = outcome({"petsc_fs_mat_type": "aij"}, options_file=str(wild))
+    assert (found["kind"], found["reason"]) == ("diverged", "DIVERGED_DTOL")
+    assert outcome(python("Wrong"), options_file=None)["kind"] == "diverged"
+
+
+def test_crash_is_named_by_its_signal(bad_pc: str) -> None:
+    found = outcome(python("Crash"), options_file=None)
+    assert (found["kind"], found["message"], found["phase"]) == ("crash", "SIGABRT in phase set-up", "set-up")
+
+
+def test_crash_by_exit_code_keeps_what_was_said(bad_pc: str) -> None:
+    found = outcome(python("Exit"), options_file=None)
+    assert found["kind"] == "crash"
+    assert "exit code 3" in found["message"]
+
+
+def test_crash_of_the_second_scene_keeps_the_first(bad_pc: str, tmp_path: Path) -> None:
+    bad = tmp_path / "bad.h5"
+    bad.write_bytes(b"")
+    records = measure(Job(scenes=[BIOT, bad]))
+    assert [(r["scene"], r["kind"]) for r in records] == [(BIOT, "converged"), (str(bad), "failed")]
+    assert "HDF5" in records[1]["message"]
+
+
+def test_hang_is_ended_with_all_its_ranks(bad_pc: str) -> None:
+    started = time.monotonic()
+    found = outcome(python("Hang"), options_file=None, time_limit=4.0, ranks=2)
+    assert (found["kind"], found["phase"]) == ("hang", "set-up")
+    assert "4 s" in found["message"]
+    assert time.monotonic() - started < 30
+    commands = [path.read_bytes() for path in Path("/proc").glob("[0-9]*/cmdline") if readable(path)]
+    assert not any(b"petsc_fs.probe" in c and str(os.getpid()).encode() in c for c in commands)
+
+
+def readable(path: Path) -> bool:
+    try:
+        path.read_bytes()
+    except OSError:
+        return False
+    return True
+
+
+def test_misspelt_option_names_the_right_one() -> None:
+    found = outcome({"fieldsplit_momentum_pc_hypre_boomeramg_strong_treshold": "0.5"})
+    assert found["kind"] == "unused_option"
+    assert "strong_treshold" in found["message"] and "strong_threshold" in found["message"]
+    assert found["iterations"] > 0
+
+
+def test_impossible_value_and_file_for_other_scenes_are_refused() -> None:
+    assert outcome({"fieldsplit_momentum_pc_type": "nonsense"})["kind"] == "refused"
+    assert outcome({}, options_file="contact_poromechanics.opts")["kind"] == "refused"
+
+
+def test_failure_on_one_rank_of_two_is_no_hang(bad_pc: str) -> None:
+    found = outcome(python("Lonely"), options_file=None, ranks=2)
+    assert (found["kind"], found["message"]) == ("failed", "only here")
+
+
+def test_out_of_memory(bad_pc: str) -> None:
+    assert outcome(python("Greedy"), options_file=None, memory_limit=4 * 2**30)["kind"] == "out_of_memory"
