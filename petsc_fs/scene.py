@@ -527,9 +527,12 @@ def gather_rows(indptr: Integers, rows: Integers) -> tuple[Integers, Integers]:
 
 def _sorted_rows(rows: Integers, cols: Integers, data: Floats, n: int) -> CSR:
     """Compressed rows with sorted columns from triplets whose rows do not decrease."""
-    order = np.lexsort((cols, rows))
     indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))])
-    return CSR(indptr, cols[order], data[order])
+    place = rows.astype(np.int64) * (int(cols.max(initial=0)) + 1) + cols
+    if (place[1:] < place[:-1]).any():
+        order = np.argsort(place, kind="stable")  # which is fast where most of it is in order, as here
+        cols, data = cols[order], data[order]
+    return CSR(indptr, cols, data)
 
 
 def _cut_rows(matrix: CSR, rows: Integers, owner: Integers, local: Integers, parts: int) -> list[CSR]:

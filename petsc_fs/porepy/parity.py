@@ -11,10 +11,11 @@ import json
 import platform
 import subprocess
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +23,9 @@ from petsc_fs.errors import UsageError
 from petsc_fs.files import write_text
 from petsc_fs.porepy.cases import ModelParameters
 from petsc_fs.scene import CONTACT_STATES
+
+if TYPE_CHECKING:
+    from petsc_fs.porepy.solver import LinearSolve
 
 Progress = Callable[[str], None]
 Row = list[int]
@@ -44,12 +48,16 @@ class Run:
         parameters: of the model.
         options_file: name of the shipped options file.
         tolerance: allowed difference of the mean number of Krylov iterations.
+        changes: PETSc options, without dashes, that go before those of the file.
+        lean: whether petsc_fs runs with `LeanModel`, which large 3D grids need.
     """
 
     model: str
     parameters: ModelParameters
     options_file: str = "contact_poromechanics.opts"
     tolerance: float = MODEL_TOLERANCE
+    changes: Mapping[str, str] = field(default_factory=dict)
+    lean: bool = False
 
 
 NORMAL_STIFFNESS = (0.0, 1.2e9, 1.2e19)
@@ -80,9 +88,11 @@ class Measured:
         unknowns: size of the systems.
         seconds: wall time.
         versions: of the programs that took part.
-        history: of the run itself.
+        history: of the run itself; it may end after any time step.
         again: Krylov iterations of petsc_fs on the very same systems, where the published code ran.
         unconverged: number of solves of petsc_fs whose true residual missed the tolerance.
+        unfinished: whether the run was stopped within the last time step of the history.
+        timings: seconds of each linear solve, see `TIMINGS`.
     """
 
     unknowns: int
@@ -91,8 +101,22 @@ class Measured:
     history: History
     again: list[list[int]] = field(default_factory=list)
     unconverged: int = 0
+    unfinished: bool = False
+    timings: list[list[float]] = field(default_factory=list)
 
 
+TIMINGS = (
+    "transfer", "set-up", "solve", "published set-up", "published solve", "processor", "published processor",
+)  # fmt: skip
+"""Columns of `Measured.timings`, in seconds; those after the first three where the published code ran.
+
+Transfer is what is left of the whole call in the simulation: taking the Jacobian apart by fields, and
+bringing it to PETSc and the solution back. The first five are seconds of the clock, the last two of the
+processor of rank 0 for the whole of each solve: where others use the machine at the same time, these
+are what can be compared, on one rank. Ranks that wait for each other use up processor time too.
+"""
+
+Keep = Callable[[Measured], None]
 Results = dict[str, dict[str, Measured]]
 """By "petsc_fs" (own run) or "published_code" (the published code's), and by name of the run."""
 
@@ -115,39 +139,81 @@ def find_run(name: str) -> Run:
 
 
 def run(name: str, progress: Progress | None = None) -> Measured:
-    """Run a model to its end with `FieldSplitSolver`.
+    """Run a model to its end with `FieldSplitSolver`, see `measure`; `name` is in `RUNS`."""
+    return measure(name, find_run(name), progress)
+
+
+def measure(
+    name: str,
+    this: Run,
+    progress: Progress | None = None,
+    *,
+    time_steps: int | None = None,
+    keep: Keep | None = None,
+) -> Measured:
+    """Run a model with `FieldSplitSolver`.
 
     Args:
-        name: in `RUNS`.
+        name: of the run, for `progress`.
+        this: what to run.
         progress: called with a line of text per Newton step.
+        time_steps: at most so many; None: all of the model.
+        keep: called after each linear solve with what there is so far, marked as unfinished.
 
     Raises:
         PetscFsError: the run cannot be made or did not converge.
     """
-    from petsc_fs.porepy.models import make_model
+    from petsc_fs.porepy.lean_model import LeanModel
+    from petsc_fs.porepy.models import StopRun, make_model
     from petsc_fs.porepy.models import run as run_model
     from petsc_fs.porepy.solver import FieldSplitSolver
 
-    this = find_run(name)
-    model = make_model(this.model, this.parameters, mixins=(FieldSplitSolver,))
+    mixins = (FieldSplitSolver, LeanModel) if this.lean else (FieldSplitSolver,)
+    model = make_model(this.model, this.parameters, mixins=mixins)
     model.params["petsc_fs_options_file"] = this.options_file
-    history: History = []
+    found = Measured(0, 0.0, versions(), [], unfinished=True)
+    started = time.perf_counter()
 
     def record(model: Any, _: Any) -> None:
         solve = model.linear_solves[-1]
-        append(history, solve.time_step, [solve.iterations, *solve.contact_states.values()])
+        if time_steps is not None and solve.time_step > time_steps:
+            raise StopRun
+        add_solve(found, solve)
+        append(found.history, solve.time_step, [solve.iterations, *solve.contact_states.values()])
+        found.seconds = time.perf_counter() - started
         if progress is not None:
-            progress(line(name, history))
+            progress(line(name, found.history))
+        if keep is not None:
+            keep(found)
 
-    started = time.perf_counter()
-    run_model(model, on_newton_step=record)
-    return Measured(
-        unknowns=model.linear_solves[-1].unknowns,
-        seconds=time.perf_counter() - started,
-        versions=versions(),
-        history=history,
-        unconverged=sum(not solve.converged for solve in model.linear_solves),
-    )
+    with changed_options(this.changes):
+        run_model(model, on_newton_step=record)
+    found.unfinished = False
+    return found
+
+
+def add_solve(found: Measured, solve: LinearSolve) -> None:
+    """Add what a linear solve of petsc_fs did, except its iterations."""
+    found.unknowns = solve.unknowns
+    found.unconverged += not solve.converged
+    transfer = solve.seconds - solve.setup_seconds - solve.solve_seconds
+    found.timings.append([transfer, solve.setup_seconds, solve.solve_seconds])
+
+
+@contextmanager
+def changed_options(changes: Mapping[str, str]) -> Iterator[None]:
+    """Have options in PETSc's database within a block; those of the command line stay as they are. Local."""
+    from petsc4py import PETSc
+
+    database = PETSc.Options()
+    new = {name: value for name, value in changes.items() if not database.hasName(name)}
+    for name, value in new.items():
+        database.setValue(name, value)
+    try:
+        yield
+    finally:
+        for name in new:
+            database.delValue(name)
 
 
 def append(history: History, time_step: int, row: Row) -> None:
@@ -229,11 +295,16 @@ def write(results: Results, path: Path) -> None:
 
 
 def _to_json(measured: Measured) -> str:
-    data = asdict(measured) | {"seconds": round(measured.seconds, 1)}
+    data = asdict(measured) | {
+        "seconds": round(measured.seconds, 1),
+        "timings": [[round(s, 4) for s in solve] for solve in measured.timings],
+    }
     parts = []
     for key, value in data.items():
+        if key in ("unfinished", "timings") and not value:
+            continue
         text = json.dumps(value)
-        if key in ("history", "again") and value:
+        if key in ("history", "again", "timings") and value:
             steps = ",\n".join("    " + json.dumps(step, separators=(",", ":")) for step in value)
             text = f"[\n{steps}\n   ]"
         parts.append(f'   "{key}": {text}')

@@ -76,7 +76,7 @@ def _model_table(runs: Mapping[str, Measured], reference: Mapping[str, History])
     allowed = {RUNS[name].tolerance for name in runs}
     within = f"within {allowed.pop():g}" if len(allowed) == 1 else "within"
     headings = ["run", "unknowns", "Newton steps", "published", "mean Krylov", "published", "difference", within]
-    return _table(headings, rows)
+    return table(headings, rows)
 
 
 def _title(name: str) -> str:
@@ -126,7 +126,7 @@ def _same_systems_table(rerun: Mapping[str, Measured]) -> str:
             ]
         )
     headings = ["run", "systems", "published code", "petsc_fs", "equal counts", "largest difference"]
-    return _table(headings, rows)
+    return table(headings, rows)
 
 
 STEPS = """\
@@ -158,7 +158,7 @@ def _steps_table(own: Mapping[str, Measured], rerun: Mapping[str, Measured], ref
             row.append(_equal(compare(measured.history, rerun[name].history)))
             row.append(_equal(compare(rerun[name].history, reference[name])))
         rows.append(row + [""] * (len(headings) - len(row)))
-    return _table(headings, rows)
+    return table(headings, rows)
 
 
 def _equal(agreement: Agreement) -> str:
@@ -194,7 +194,7 @@ def _how(own: Mapping[str, Measured], rerun: Mapping[str, Measured]) -> str:
         "- Set-up: " + "; ".join(f"{name}: {_loads(name)}" for name in ("model1", "model2", "model3")) + ".",
     ]
     for label, runs in (("petsc_fs", own), ("The published code", rerun)):
-        for text in sorted({_versions_text(m.versions) for m in runs.values()}):
+        for text in sorted({versions_text(m.versions) for m in runs.values()}):
             lines.append(f"- {label} ran with {text}, on one rank.")
     for label, runs in (("the runs of petsc_fs", own), ("the second solves of the published code's systems", rerun)):
         if runs:
@@ -210,11 +210,12 @@ def _loads(name: str) -> str:
     return f"{loads}, {case.time_steps} steps of {case.time_step:g} s"
 
 
-def _versions_text(found: Mapping[str, str]) -> str:
+def versions_text(found: Mapping[str, str]) -> str:
+    """Programs and their versions in words."""
     return ", ".join(f"{program} {version}" for program, version in found.items())
 
 
-def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table; the first column is text, the others are numbers."""
     rule = ["---", *["--:"] * (len(headings) - 1)]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in [headings, rule, *rows])
