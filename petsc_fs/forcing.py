@@ -19,14 +19,15 @@ class EisenstatWalkerParameters:
 
     Attributes:
         rtol0: first term of each time step.
-        rtolmax: the largest term.
+        rtolmax: the largest term. Textbooks have 0.1 and more, which takes more Newton steps here: contact states
+            follow the direction of the update, and each step costs an assembly and a set-up (docs/newton.md).
         gamma: factor.
         alpha: exponent.
         threshold: how large the safeguard has to be to act.
     """
 
-    rtol0: float = 0.1
-    rtolmax: float = 0.1
+    rtol0: float = 1e-4
+    rtolmax: float = 1e-4
     gamma: float = 1.0
     alpha: float = (1 + 5**0.5) / 2
     threshold: float = 0.1

@@ -1,6 +1,8 @@
 """Memory by phase, and that the large blocks of a scene are not held more often than needed."""
 
 import gc
+import subprocess
+import sys
 import weakref
 from pathlib import Path
 
@@ -100,13 +102,21 @@ def test_source_is_freed_once_petsc_has_it(release: bool):
 
 @linux
 def test_building_does_not_hold_the_matrix_twice(returns_freed: None):
+    """In a process of its own: what other tests have freed would be filled first, and hide what is new."""
+    command = [sys.executable, "-c", "import test_memory; test_memory.build_and_print()"]
+    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, timeout=60, check=True)
+    assert abs(float(done.stdout)) < 3, "a copy is 12 bytes an entry"
+
+
+def build_and_print() -> None:
+    """Bytes held after building a system, per entry of its matrix."""
+    memory.return_freed()
     scene = banded_scene(rows=12_000, width=150)
     entries = scene.blocks["momentum", "momentum"].data.size
     phases = memory.Phases()
     solver = Solver(scene, MPI.COMM_SELF, release=True)
     phases.end("build")
-    per_entry = (phases.helds["build"] - phases.start) / entries
-    assert abs(per_entry) < 3, "a copy is 12 bytes an entry"
+    print((phases.helds["build"] - phases.start) / entries)
     solver.destroy()
 
 

@@ -20,12 +20,17 @@ from petsc_fs.errors import SolveError, UsageError
 from petsc_fs.files import write_text
 from petsc_fs.forcing import EisenstatWalkerParameters
 
-RUNS = (("model1", 2.0), ("model1", 5.0), ("model2", 2.0), ("model2", 5.0), ("model3", 0.5))
+RUNS = (("model1", 1.0), ("model1", 2.0), ("model2", 1.0), ("model2", 2.0), ("model3", 0.25))
 """Models and refinements of the page."""
 
 FORCING = {
     "fixed": {},
     "eisenstat_walker": {"petsc_fs_forcing": "eisenstat_walker"},
+    "eisenstat_walker, 0.1": {
+        "petsc_fs_forcing": "eisenstat_walker",
+        "petsc_fs_ew_rtol0": "0.1",
+        "petsc_fs_ew_rtolmax": "0.1",
+    },
     "fixed, 1e-12": {"ksp_rtol": "1e-12"},
 }
 """Name of a kind of forcing, to its options; all others are compared with the first."""
@@ -208,7 +213,7 @@ Written by `scripts/newton`. Each model runs to its end on one rank with the New
 on residual and contact constraints, nonlinear tolerance 1e-7 in PorePy's residual norm. In one run all linear systems
 are solved to 1e-10 (`fixed`), in the other as far as `-petsc_fs_forcing eisenstat_walker` says with its defaults:
 rtol0 {p.rtol0:g}, rtolmax {p.rtolmax:g}, gamma {p.gamma:g}, alpha {p.alpha:.3f}, and the guard at the end (see
-`petsc_fs.forcing`).
+`petsc_fs.forcing`). `eisenstat_walker, 0.1` has the usual textbook values rtol0 = rtolmax = 0.1.
 
 *Largest residual* is that at the end of a time step, as Newton judges it. *Difference* is the largest over time steps
 and fields between the states and those of `fixed`, |x - y| / |y|, and the field where it is. `fixed, 1e-12`, in which

@@ -86,10 +86,8 @@ In one run, each linear system of the published code's simulation is solved by b
 that goes first changes from system to system. "Published code" is all of its `solve_linear_system`, on one rank;
 "petsc_fs" is all of `FieldSplitSolver.solve_linear_system`, which keeps its solver between Newton steps as in any
 simulation with it: taking the Jacobian apart by fields and bringing it to PETSc (transfer), building the matrices and
-setting the preconditioner up, the Krylov method, and the way back. The machine has two cores, which other programs
-used at the same time. So the seconds of the clock are too many in both columns, and on two ranks, which wait for each
-other, most of all in that of petsc_fs; on one rank those of the processor can be compared. Ratios are published code
-to petsc_fs.
+setting the preconditioner up, the Krylov method, and the way back. Where the seconds of the clock are more than those
+of the processor, other programs ran on the machine's two cores at the same time. Ratios are published code to petsc_fs.
 """
 
 
