@@ -20,9 +20,9 @@ from petsc_fs import hdf5, options
 from petsc_fs.fields import FIELDS
 from petsc_fs.files import write_text
 from petsc_fs.scene import CSR, Scene
+from petsc_fs.tree import CANONICAL
 
 SCENES = Path(__file__).parent / "scenes"
-CANONICAL = "contact_poromechanics.opts"
 TREES = ("smallest", "unpruned")
 WARM = 3
 """Solves in each process of which the median counts, after a first one that loads libraries."""

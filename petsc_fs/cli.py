@@ -27,9 +27,6 @@ if TYPE_CHECKING:
     from petsc_fs.solver import Result, Solver
     from petsc_fs.tree import Tree
 
-CANONICAL = "contact_poromechanics.opts"
-"""Options file with all levels, from which `solve` and `options` cut the smallest tree for a scene."""
-
 TAKES_PETSC = ("solve", "compare", "run")
 """Commands that pass PETSc's options on."""
 
@@ -274,7 +271,7 @@ def _solve(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> i
 def tree_for(scene: Scene, comm: MPI.Intracomm) -> Tree:
     """The smallest solver tree for a scene, from the canonical options file. Collective."""
     from petsc_fs import options
-    from petsc_fs.tree import Facts, smallest_tree
+    from petsc_fs.tree import CANONICAL, Facts, smallest_tree
 
     return smallest_tree(options.parse(options.find_options_file(CANONICAL)), Facts.of(scene, comm))
 
@@ -384,17 +381,8 @@ def _report(
         "dimension": scene.dimension,
         "fields": {f: solver.layout.sizes(f)[1] for f in solver.layout.fields},
         "ranks": solver.layout.comm.size,
-        "iterations": result.iterations,
-        "converged": result.converged,
-        "reason": result.reason,
-        "tolerance": result.tolerance,
-        "limited_by_rounding": result.limited_by_rounding,
-        "true_relative_residual": result.true_relative_residual,
-        "residual_by_field": result.residual_by_field,
-        "error_by_field": result.error_by_field,
         "read_seconds": read_seconds,
-        "setup_seconds": result.setup_seconds,
-        "solve_seconds": result.solve_seconds,
+        **result.report(),
         "memory_bytes": memory,
         "options_file": options_file.name if options_file is not None else None,
         "left_out": [str(part) for part in tree.left_out] if tree is not None else [],
@@ -475,6 +463,7 @@ def _options(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) ->
     from mpi4py import MPI
 
     from petsc_fs import hdf5
+    from petsc_fs.tree import CANONICAL
 
     with together(comm):
         path = find_scene(args.scene)

@@ -660,8 +660,9 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
     except OSError as e:
         raise UsageError(f"--out {out}: cannot be made: {e.strerror}") from e
     from petsc_fs import compare_plots
+    from petsc_fs.plot import pyplot
 
-    compare_plots.require()
+    pyplot()  # or an error, before anything is measured
     if args.again is not None:
         try:
             found = Comparison.from_json(args.again.read_text(encoding="utf-8"))

@@ -16,6 +16,7 @@ import numpy as np
 from petsc_fs.compare import CLOCKS, Case, Comparison, Entry, Point, Spread, points
 from petsc_fs.errors import UsageError
 from petsc_fs.measure import Record
+from petsc_fs.plot import pyplot
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
@@ -57,22 +58,6 @@ class Picture:
     caption: str
 
 
-def require() -> Any:
-    """Matplotlib, drawing into files.
-
-    Raises:
-        UsageError: it is missing.
-    """
-    try:
-        import matplotlib
-
-        matplotlib.use("Agg")
-        import matplotlib.pyplot as plt
-    except ImportError as e:
-        raise UsageError(f"pictures need matplotlib ({e}); pip install 'petsc_fs[plot]'") from e
-    return plt
-
-
 @dataclass(frozen=True)
 class Look:
     """Colour, marker and dashes of a file."""
@@ -109,7 +94,7 @@ def draw(
     Raises:
         UsageError: matplotlib is missing, or a picture cannot be written.
     """
-    plt = require()
+    plt = pyplot()
     everything = points(found.records, found.clock)
     draws = dict(zip(KINDS, (_work_precision, _history, _cost), strict=True))
     pictures = []
@@ -135,7 +120,7 @@ def _save(figure: Any, path: Path) -> tuple[Path, Path]:
     except OSError as e:
         raise UsageError(f"{target}: cannot be drawn: {e}") from e
     finally:
-        require().close(figure)
+        pyplot().close(figure)
     return paths
 
 
@@ -150,7 +135,7 @@ def _work_precision(
     found: Comparison, case: Case, mine: Sequence[Point], styles: Mapping[str, Look], path: Path
 ) -> Picture:
     """Error against seconds, set-up included and excluded, a row for each number of ranks."""
-    plt = require()
+    plt = pyplot()
     width = 9.2
     figure, grid = plt.subplots(
         len(found.ranks),
@@ -247,7 +232,7 @@ def _history(
     found: Comparison, case: Case, mine: Sequence[Point], styles: Mapping[str, Look], path: Path
 ) -> Picture | None:
     """Error and residual over time, of all fields and of each, on the least number of ranks."""
-    plt = require()
+    plt = pyplot()
     records = [r for r in found.records if r["scene"] == case.label and r["history"]]
     if not records:
         return None
@@ -319,7 +304,7 @@ def _trace(axes: Any, seconds: Sequence[float], values: Sequence[float], look: L
 
 def _cost(found: Comparison, case: Case, mine: Sequence[Point], styles: Mapping[str, Look], path: Path) -> Picture:
     """Time by phase and memory of each file and number of ranks, for a tolerance in the middle."""
-    plt = require()
+    plt = pyplot()
     rtols = sorted({p.rtol for p in mine}, reverse=True)
     rtol = rtols[len(rtols) // 2]
     bars = [

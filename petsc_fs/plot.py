@@ -1,4 +1,4 @@
-"""Pictures; the only module that imports matplotlib."""
+"""Pictures of scenes and runs, and matplotlib for all other modules that draw."""
 
 from __future__ import annotations
 
@@ -14,14 +14,19 @@ from petsc_fs.fields import FIELD
 from petsc_fs.scene import CONTACT_STATES, Floats, Integers, Scene, singular_diagonal_blocks
 
 
-def _pyplot() -> Any:
+def pyplot() -> Any:
+    """Matplotlib's pyplot, drawing into files.
+
+    Raises:
+        UsageError: it is missing.
+    """
     try:
         import matplotlib
 
         matplotlib.use("Agg")
         import matplotlib.pyplot as plt
     except ImportError as e:
-        raise UsageError(f"plots need matplotlib ({e}); pip install 'petsc_fs[plot]'") from e
+        raise UsageError(f"pictures need matplotlib ({e}); pip install 'petsc_fs[plot]'") from e
     return plt
 
 
@@ -39,7 +44,7 @@ def plot_blocks(scene: Scene, path: str | os.PathLike[str]) -> Path:
     Raises:
         UsageError: matplotlib is missing or does not know the format.
     """
-    plt = _pyplot()
+    plt = pyplot()
     names = scene.fields
     n = len(names)
     steps = stages(scene)
@@ -88,7 +93,7 @@ def _save(figure: Any, target: Path) -> Path:
         target.unlink(missing_ok=True)
         raise UsageError(f"{target}: cannot be drawn: {e}") from e
     finally:
-        _pyplot().close(figure)
+        pyplot().close(figure)
     return target
 
 
@@ -162,7 +167,7 @@ def plot_contact_states(
     Raises:
         UsageError: matplotlib is missing or does not know the format, or no record has contact states.
     """
-    plt = _pyplot()
+    plt = pyplot()
     shown = [record for record in records if record["contact_states"]]
     if not shown:
         raise UsageError(f"{path}: no contact states to draw")

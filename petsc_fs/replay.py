@@ -16,7 +16,7 @@ from petsc_fs.errors import PetscFsError, UsageError, together
 from petsc_fs.files import write_text
 from petsc_fs.layout import Layout
 from petsc_fs.pattern import UnionPattern
-from petsc_fs.tree import Facts, Tree, smallest_tree
+from petsc_fs.tree import CANONICAL, Facts, Tree, smallest_tree
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -118,18 +118,9 @@ class Player:
             "newton_index": step.newton_index,
             "unknowns": sum(step.sizes.values()),
             "contact_states": step.contact_states,
-            "iterations": result.iterations,
             "iterations_in_run": step.run.get("iterations"),
-            "converged": result.converged,
-            "reason": result.reason,
-            "tolerance": result.tolerance,
-            "limited_by_rounding": result.limited_by_rounding,
-            "true_relative_residual": result.true_relative_residual,
-            "residual_by_field": result.residual_by_field,
-            "error_by_field": result.error_by_field,
             "read_seconds": read_seconds,
-            "setup_seconds": result.setup_seconds,
-            "solve_seconds": result.solve_seconds,
+            **result.report(),
         }
 
     def _read(self, step: Step) -> tuple[Scene, Layout]:
@@ -203,7 +194,7 @@ class Player:
             return
         self._forget_solver()
         options.delete_all(self._inserted)
-        self.tree = smallest_tree(options.parse(options.find_options_file(cli.CANONICAL)), facts)
+        self.tree = smallest_tree(options.parse(options.find_options_file(CANONICAL)), facts)
         self._inserted = options.insert_all(self.tree.options)
         self._facts = facts
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from petsc_fs.errors import UsageError
+from petsc_fs.plot import pyplot
 from petsc_fs.scaling import Run, by_case, median
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -41,13 +42,7 @@ def plot(runs: Sequence[Run], target: Path) -> Path:
     lines = series(runs)
     if not lines:
         raise UsageError(f"{target}: no run worked, so there is nothing to draw")
-    try:
-        import matplotlib
-
-        matplotlib.use("Agg")
-        import matplotlib.pyplot as plt
-    except ImportError as e:
-        raise UsageError(f"plots need matplotlib ({e}); pip install 'petsc_fs[plot]'") from e
+    plt = pyplot()
     figure, grid = plt.subplots(2, 3, figsize=(11, 6.4), layout="constrained")
     for axes, panel in zip(grid.flat, PANELS, strict=True):
         for k, (label, at) in enumerate(lines.items()):

@@ -9,7 +9,7 @@ import re
 import sys
 import time
 import weakref
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -65,6 +65,10 @@ class Result:
     solve_seconds: float
     solution: FieldArrays = field(repr=False)
     rtol: float = 0.0
+
+    def report(self) -> dict[str, Any]:
+        """All of it but the solution, for JSON."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "solution"}
 
 
 _numbers = itertools.count()

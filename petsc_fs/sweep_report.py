@@ -15,7 +15,7 @@ from typing import Any
 
 from petsc_fs import measure
 from petsc_fs.files import complete, write_text
-from petsc_fs.plot import _pyplot
+from petsc_fs.plot import pyplot
 from petsc_fs.space import ABSENT
 from petsc_fs.sweep import OBJECTIVES, OUTCOMES, STARTUP_TRIALS
 
@@ -322,7 +322,7 @@ def plot(results: Results, target: Path) -> None:
     Raises:
         UsageError: matplotlib is missing or cannot write the file.
     """
-    plt = _pyplot()
+    plt = pyplot()
     how = results["aggregate"]
     x_name, y_name = results["front_objectives"][:2]
     solved = [t for t in results["trials"] if t["outcome"] == "solved" and t["same_as"] is None]

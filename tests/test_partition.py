@@ -311,6 +311,12 @@ PAIRS = [
 def test_iterations_do_not_depend_on_ranks(database, file, name):
     """Within 10 %, rounded up to a whole iteration."""
     database(file)
+    if file == "fixed_stress_richardson.opts":
+        from petsc4py import PETSc
+
+        # Its absolute tolerance lies below what rounding in the factorisations leaves of model1's preconditioned
+        # residual, which wanders between 1e-10 and 2e-9 then: where it stops there is chance.
+        PETSc.Options().setValue("ksp_atol", 1e-8)
     scene = load(name)
     alone = comm.bcast(Solver(scene, MPI.COMM_SELF).solve().iterations if comm.rank == 0 else 0)
     result = Solver(scene).solve()

@@ -17,13 +17,12 @@ from test_solver import load, unequal
 
 import petsc_fs
 from petsc_fs import options
-from petsc_fs.cli import CANONICAL
 from petsc_fs.errors import SceneError, UsageError
 from petsc_fs.fields import FIELD_NAMES
 from petsc_fs.layout import Layout
 from petsc_fs.scene import CSR, Scene
 from petsc_fs.solver import Result, Solver
-from petsc_fs.tree import Facts, Tree, smallest_tree
+from petsc_fs.tree import CANONICAL, Facts, Tree, smallest_tree
 
 comm = MPI.COMM_WORLD
 MPIEXEC = Path(petsc_fs.__path__[0]).parent / "scripts" / "mpiexec"

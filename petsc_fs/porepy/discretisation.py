@@ -374,9 +374,10 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
     for what, values in (("--refine", args.refine), ("--rtol", args.rtol)):
         if not all(math.isfinite(v) and v > 0 for v in values):
             raise UsageError(f"{what}: expected positive numbers, found {' '.join(f'{v:g}' for v in values)}")
+    from petsc_fs.plot import pyplot
     from petsc_fs.porepy import discretisation_page
 
-    discretisation_page.require()
+    pyplot()  # or an error, before anything is measured
     earlier = joined([from_json(file) for file in args.files]) if args.files else None
     if earlier is None:
         require_porepy()

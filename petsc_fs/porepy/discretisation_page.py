@@ -7,8 +7,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from petsc_fs.errors import UsageError
 from petsc_fs.files import complete
+from petsc_fs.plot import pyplot
 from petsc_fs.porepy.discretisation import CASES, DEFAULT_RTOL, MARGIN, Run, Study, needed_tolerance, orders
 
 LOOKS = (
@@ -48,29 +48,13 @@ DESCRIPTIONS = {
 }
 
 
-def require() -> Any:
-    """Matplotlib's pyplot, drawing into files.
-
-    Raises:
-        UsageError: it is missing.
-    """
-    try:
-        import matplotlib
-
-        matplotlib.use("Agg")
-        import matplotlib.pyplot as plt
-    except ImportError as e:
-        raise UsageError(f"pictures need matplotlib ({e}); pip install 'petsc_fs[plot]'") from e
-    return plt
-
-
 def draw(result: Study, target: Path) -> None:
     """Draw error against seconds and against cells, a row per case, a curve per tolerance.
 
     Raises:
         UsageError: matplotlib is missing, or the file cannot be written.
     """
-    plt = require()
+    plt = pyplot()
     from matplotlib import ticker
 
     cases = result.cases

@@ -11,8 +11,7 @@ import json
 import platform
 import subprocess
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -166,7 +165,7 @@ def measure(
     from petsc_fs.porepy.lean_model import LeanModel
     from petsc_fs.porepy.models import StopRun, make_model
     from petsc_fs.porepy.models import run as run_model
-    from petsc_fs.porepy.solver import FieldSplitSolver
+    from petsc_fs.porepy.solver import FieldSplitSolver, inserted
 
     mixins = (FieldSplitSolver, LeanModel) if this.lean else (FieldSplitSolver,)
     model = make_model(this.model, this.parameters, mixins=mixins)
@@ -186,7 +185,7 @@ def measure(
         if keep is not None:
             keep(found)
 
-    with changed_options(this.changes):
+    with inserted(this.changes):
         run_model(model, on_newton_step=record)
     found.unfinished = False
     return found
@@ -198,22 +197,6 @@ def add_solve(found: Measured, solve: LinearSolve) -> None:
     found.unconverged += not solve.converged
     transfer = solve.seconds - solve.setup_seconds - solve.solve_seconds
     found.timings.append([transfer, solve.setup_seconds, solve.solve_seconds])
-
-
-@contextmanager
-def changed_options(changes: Mapping[str, str]) -> Iterator[None]:
-    """Have options in PETSc's database within a block; those of the command line stay as they are. Local."""
-    from petsc4py import PETSc
-
-    database = PETSc.Options()
-    new = {name: value for name, value in changes.items() if not database.hasName(name)}
-    for name, value in new.items():
-        database.setValue(name, value)
-    try:
-        yield
-    finally:
-        for name in new:
-            database.delValue(name)
 
 
 def append(history: History, time_step: int, row: Row) -> None:

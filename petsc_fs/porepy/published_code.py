@@ -28,13 +28,12 @@ from petsc_fs.porepy.parity import (
     Run,
     add_solve,
     append,
-    changed_options,
     commit,
     find_run,
     line,
     versions,
 )
-from petsc_fs.porepy.solver import FieldSplitSolver
+from petsc_fs.porepy.solver import FieldSplitSolver, inserted
 
 PREFIX = "petsc_fs_again_"
 """Of the options of the second solve: the published code clears all options before each of its own."""
@@ -144,7 +143,7 @@ def measure(
             changes = {PREFIX + key: value for key, value in {"petsc_fs_restarts": "0", **this.changes}.items()}
             processor = time.process_time()
             try:
-                with changed_options(changes):
+                with inserted(changes):
                     FieldSplitSolver.solve_linear_system(self)
             finally:
                 self._processor = time.process_time() - processor
