@@ -331,18 +331,13 @@ def _iterative(scene: Scene, matrix: CSR) -> Iterator[tuple[Solve, str]]:
 @contextmanager
 def _options(values: Mapping[str, str | None]) -> Iterator[None]:
     """Options under `PREFIX` for the time of a block; the user's own win."""
-    from petsc4py import PETSc
-
     from petsc_fs import options
 
-    database = PETSc.Options()
-    added = [PREFIX + name for name in values if PREFIX + name not in database.getAll()]
-    options.insert_all(values, PREFIX)
+    added = options.insert_all(values, PREFIX)
     try:
         yield
     finally:
-        for name in added:
-            database.delValue(name)
+        options.delete_all(added)
 
 
 def digest(path: str | os.PathLike[str]) -> str:

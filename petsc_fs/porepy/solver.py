@@ -449,16 +449,8 @@ def inserted(values: Path | Mapping[str, str | None], prefix: str = "") -> Itera
     Raises:
         UsageError: the file cannot be read.
     """
-    from petsc4py import PETSc
-
-    database = PETSc.Options()
-    already = database.getAll()
-    chosen = options.parse(values) if isinstance(values, Path) else values
-    new = {prefix + name: value for name, value in chosen.items() if prefix + name not in already}
-    for name, value in new.items():
-        database.setValue(name, value)
+    new = options.insert_all(options.parse(values) if isinstance(values, Path) else values, prefix)
     try:
         yield
     finally:
-        for name in new:
-            database.delValue(name)
+        options.delete_all(new)
