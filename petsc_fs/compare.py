@@ -655,10 +655,6 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
     if comm.size > 1:
         raise UsageError("compare starts mpiexec itself: call it without, and give it -n RANKS")
     out: Path = args.out
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as e:
-        raise UsageError(f"--out {out}: cannot be made: {e.strerror}") from e
     from petsc_fs import compare_plots
     from petsc_fs.plot import pyplot
 
@@ -668,6 +664,7 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
             found = Comparison.from_json(args.again.read_text(encoding="utf-8"))
         except (OSError, ValueError, TypeError, KeyError) as e:
             raise UsageError(f"--again {args.again}: not a comparison: {e}") from e
+        _make_folder(out)
     else:
         found = _measure_all(args, petsc)
     from petsc_fs.compare_page import page, terminal_summary
@@ -682,6 +679,14 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
     print(terminal_summary(found))
     print(f"written: {out / 'compare.html'}, with compare.csv, compare.json and {len(pictures)} pictures beside it")
     return 0
+
+
+def _make_folder(folder: Path) -> None:
+    """Make the folder of --out, once nothing in the call is found wrong any more."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise UsageError(f"--out {folder}: cannot be made: {e.strerror}") from e
 
 
 @contextmanager
@@ -712,6 +717,7 @@ def _measure_all(args: argparse.Namespace, petsc: list[str]) -> Comparison:
         raise UsageError("--ranks, --repeat and --time-limit must be positive")
     cases = find_cases(args.scenes)
     entries = find_entries(args.options, cases, more)
+    _make_folder(args.out)
     total = sum(1 for _ in schedule(cases, entries, ranks, args.repeat))
     started = time.time()
     with Progress(total) as progress, _interruptible():

@@ -390,13 +390,13 @@ def test_command_from_scene_to_page(tmp_path: Path, capsys: pytest.CaptureFixtur
 @pytest.mark.parametrize(
     ("call", "code", "said"),
     [
-        (["--out", "{tmp}"], 2, "at least one scene"),
-        (["nothing.h5", "--out", "{tmp}"], 3, "no such file"),
-        (["biot.h5", "--rtol", "7", "--out", "{tmp}"], 2, "between 0 and 1"),
-        (["biot.h5", "--ranks", "0", "--out", "{tmp}"], 2, "positive"),
-        (["biot.h5", "--options", "flow.opts", "--out", "{tmp}"], 2, "for none of the scenes"),
+        (["--out", "{tmp}/new"], 2, "at least one scene"),
+        (["nothing.h5", "--out", "{tmp}/new"], 3, "no such file"),
+        (["biot.h5", "--rtol", "7", "--out", "{tmp}/new"], 2, "between 0 and 1"),
+        (["biot.h5", "--ranks", "0", "--out", "{tmp}/new"], 2, "positive"),
+        (["biot.h5", "--options", "flow.opts", "--out", "{tmp}/new"], 2, "for none of the scenes"),
         (["biot.h5", "--out", "{tmp}/file/x"], 2, "cannot be made"),
-        (["--again", "{tmp}/file", "--out", "{tmp}"], 2, "not a comparison"),
+        (["--again", "{tmp}/file", "--out", "{tmp}/new"], 2, "not a comparison"),
     ],
 )
 def test_wrong_calls(call: list[str], code: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -404,3 +404,4 @@ def test_wrong_calls(call: list[str], code: int, said: str, tmp_path: Path, caps
     assert main(["compare", *(word.replace("{tmp}", str(tmp_path)) for word in call)]) == code
     error = capsys.readouterr().err.strip()
     assert said in error and len(error.splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
