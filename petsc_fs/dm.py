@@ -18,6 +18,7 @@ from petsc4py import PETSc
 from petsc_fs.errors import UsageError
 from petsc_fs.fields import MECHANICS
 from petsc_fs.layout import Layout
+from petsc_fs.reuse import Reuse
 from petsc_fs.scene import Integers
 
 Members = Sequence[tuple[str, tuple[str, ...]]]
@@ -39,6 +40,7 @@ class Problem:
         fixed_stress: (mass rows on this rank, 2): for damping exponent t the diagonal is
             first column * second column ** t; None without material data.
         contact_state: (fracture cells on this rank,) or None; used to explain errors.
+        reuse: keeps what levels have built from one matrix to the next; None if nothing does.
     """
 
     layout: Layout
@@ -46,6 +48,7 @@ class Problem:
     cell_centers: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     fixed_stress: NDArray[np.float64] | None = None
     contact_state: Integers | None = None
+    reuse: Reuse | None = None
 
 
 def field_dm(problem: Problem, members: Members) -> PETSc.DMShell:
@@ -148,12 +151,14 @@ def one_matrix(
         blocks: matrices by pairs of fields, copied.
         layout: distribution of rows.
         out: an earlier result of the same pattern, to take the new values.
-        mat_type: "aij", or "hypre" for the storage that PCHYPRE works on, of which it then needs no copy.
-            One field alone is passed on by reference, as AIJ.
+        mat_type: "aij"; or "hypre" for the storage that PCHYPRE works on, of which it then needs no copy; or "nest"
+            for a MatNest of the blocks by reference. One field alone is passed on by reference, as AIJ.
     """
     if len(fields) == 1:
         return blocks[fields[0], fields[0]]
     nest = _nest(fields, fields, blocks, layout)
+    if mat_type == "nest":
+        return nest
     matrix = nest.convert("aij", PETSc.Mat() if out is None else out)
     nest.destroy()
     if mat_type != "aij":

@@ -82,6 +82,7 @@ def _option_prefixes(pc: PETSc.PC) -> Iterator[str]:
         for ksp in pc.getFieldSplitSubKSP():
             yield from _option_prefixes(ksp.getPC())
     elif pc.getType() == "python":
-        inner = getattr(pc.getPythonContext(), "inner", None)
-        if inner is not None:
-            yield from _option_prefixes(inner)
+        context = pc.getPythonContext()
+        inner = getattr(context, "inner", None)
+        for one in [inner] if inner is not None else getattr(context, "inners", ()):
+            yield from _option_prefixes(one)

@@ -23,7 +23,17 @@ from petsc_fs.fields import FIELD_NAMES, in_order
 if TYPE_CHECKING:
     from petsc_fs.tree import LeftOut
 
-OWN = ("petsc_fs_mat_type", "petsc_fs_restarts", "petsc_fs_true_rtol")
+OWN = (
+    "petsc_fs_mat_type",
+    "petsc_fs_restarts",
+    "petsc_fs_true_rtol",
+    "petsc_fs_error_factor",
+    "petsc_fs_scaling",
+    "petsc_fs_reuse",
+    "petsc_fs_reuse_changed",
+    "petsc_fs_reuse_growth",
+    "petsc_fs_reuse_age",
+)
 """Options of `petsc_fs.solver.Solver`."""
 
 SPLIT = r"(?<!pc_)fieldsplit_(?:intf_force|intf_flow|[A-Za-z]+|\d+)_"

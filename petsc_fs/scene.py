@@ -14,6 +14,7 @@ from petsc_fs.fields import FIELD, FIELD_NAMES, in_order
 from petsc_fs.layout import rows_of
 
 if TYPE_CHECKING:
+    from petsc_fs.cutting import Cutter
     from petsc_fs.layout import Layout
 
 Floats = NDArray[np.float64]
@@ -35,6 +36,13 @@ class CSR(NamedTuple):
     indptr: Integers
     indices: Integers
     data: Floats
+
+
+class Columns(NamedTuple):
+    """For each column of a whole matrix the number of its field, and its number there."""
+
+    owner: Integers
+    local: Integers
 
 
 @dataclass(kw_only=True)
@@ -157,6 +165,7 @@ class Scene:
         *,
         dimension: int,
         columns: Mapping[str, Any] | None = None,
+        cutter: Cutter | None = None,
         **known: Any,
     ) -> Scene:
         """Cut one sparse matrix into the blocks of a scene.
@@ -169,6 +178,7 @@ class Scene:
                 Vector fields list all components of a cell before the next cell.
             dimension: of the rock matrix.
             columns: field name to the columns of its unknowns, where they differ from the rows.
+            cutter: remembers how a matrix was cut, which makes it faster for the next one of the same pattern.
             known: further attributes of the scene (`material`, `cell_centers`, `reference`, ...).
 
         Raises:
@@ -192,20 +202,21 @@ class Scene:
         for unknown in set(fields) - set(FIELD_NAMES):
             raise LayoutError(f"unknown field {unknown!r}; fields are {', '.join(FIELD_NAMES)}")
         row_ids = {f: _indices(fields[f], n) for f in names}
+        whole = CSR(np.asarray(matrix.indptr, dtype=np.int64), np.asarray(matrix.indices), np.asarray(matrix.data))
         col_ids = {f: _indices(columns[f], n) for f in names} if columns is not None else row_ids
         for f in names:
             if row_ids[f].size != col_ids[f].size:
                 raise LayoutError(f"{f}: {row_ids[f].size} rows but {col_ids[f].size} columns; they must pair up")
         _inverse(row_ids, n, "row")
-        owner, local = _inverse(col_ids, n, "column")
+        target = _inverse(col_ids, n, "column")
 
-        indptr = np.asarray(matrix.indptr, dtype=np.int64)
         blocks: dict[tuple[str, str], CSR] = {}
-        whole = CSR(indptr, np.asarray(matrix.indices), np.asarray(matrix.data))
         for r in names:
-            for c, block in zip(names, _cut_rows(whole, row_ids[r], owner, local, len(names)), strict=True):
-                if block.data.size:
-                    blocks[r, c] = block
+            if cutter is not None:
+                cut = cutter.cut(r, whole, row_ids[r], target, len(names))
+            else:
+                cut = cut_rows(whole, row_ids[r], target, len(names))
+            blocks |= {(r, c): block for c, block in zip(names, cut, strict=True) if block.data.size}
         scene = cls(
             dimension=dimension,
             sizes={f: row_ids[f].size for f in names},
@@ -497,7 +508,7 @@ def _indices(spec: Any, n: int) -> Integers:
     return np.asarray(spec, dtype=np.int64).ravel()
 
 
-def _inverse(ids: Mapping[str, Integers], n: int, what: str) -> tuple[Integers, Integers]:
+def _inverse(ids: Mapping[str, Integers], n: int, what: str) -> Columns:
     """For each index the number of its field and its place there.
 
     Raises:
@@ -515,7 +526,7 @@ def _inverse(ids: Mapping[str, Integers], n: int, what: str) -> tuple[Integers, 
     missing = np.flatnonzero(owner < 0)
     if missing.size:
         raise LayoutError(f"{missing.size} {what}s belong to no field, the first is {missing[0]}")
-    return owner, local
+    return Columns(owner, local)
 
 
 def gather_rows(indptr: Integers, rows: Integers) -> tuple[Integers, Integers]:
@@ -535,17 +546,17 @@ def _sorted_rows(rows: Integers, cols: Integers, data: Floats, n: int) -> CSR:
     return CSR(indptr, cols, data)
 
 
-def _cut_rows(matrix: CSR, rows: Integers, owner: Integers, local: Integers, parts: int) -> list[CSR]:
+def cut_rows(matrix: CSR, rows: Integers, target: Columns, parts: int) -> list[CSR]:
     """Some rows of a matrix, cut by the owners of their columns, which are renumbered and sorted."""
     blocks: list[list[CSR]] = [[] for _ in range(parts)]
     for piece in _pieces(matrix.indptr, rows):
         take, counts = gather_rows(matrix.indptr, piece)
         cols, data = matrix.indices[take], matrix.data[take].astype(np.float64, copy=False)
         row_of = np.repeat(np.arange(piece.size), counts)
-        owners = owner[cols]
+        owners = target.owner[cols]
         for k, block in enumerate(blocks):
             mine = owners == k
-            block.append(_sorted_rows(row_of[mine], local[cols[mine]], data[mine], piece.size))
+            block.append(_sorted_rows(row_of[mine], target.local[cols[mine]], data[mine], piece.size))
     return [_stack(block) for block in blocks]
 
 

@@ -350,9 +350,7 @@ class _Rank:
     def take_structure(self, handle: int, structures: list[Structure] | None = None) -> None:
         """Get from rank 0 what stays the same from solve to solve."""
         kept = self._kept[handle]
-        if kept.solver is not None:
-            kept.solver.destroy()
-        kept.solver = kept.values = None
+        kept.values = None  # the solver stays: its update makes those blocks anew that have grown
         if structures is None:
             kept.structure = self.control.recv(source=0)
             return

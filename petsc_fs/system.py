@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
@@ -33,6 +36,7 @@ class System:
         b: right-hand side, numbered as J: on each rank field by field.
         dm: names the members.
         problem: what the DM carries.
+        row_scale: what the rows of each field have been multiplied by, see `scale_rows`.
     """
 
     def __init__(
@@ -86,13 +90,21 @@ class System:
         self.b = self.J.createVecLeft()
         centers = scene.cell_centers if near_null_space else {}
         self.problem = Problem(layout, self.blocks, centers, coefficients, scene.contact_state)
+        self.row_scale = dict.fromkeys(fields, 1.0)
+        self._fingerprints: Sequence[_Fingerprint | None] = [None] * len(self.blocks)  # none before there is an update
         self.dm = field_dm(self.problem, self.members)
         self.set_rhs(scene.rhs)
 
-    def update(self, scene: Scene) -> None:
+    def update(self, scene: Scene, *, grow: bool = False) -> None:
         """Replace the values of matrix and right-hand side, keeping every PETSc object.
 
-        Collective. The material data of the fixed-stress diagonal are replaced too.
+        Collective. The material data of the fixed-stress diagonal are replaced too. Blocks with the values of the last
+        update are left alone.
+
+        Args:
+            scene: with the sizes of the first one.
+            grow: whether blocks with an entry outside their nonzero pattern are made anew, and J with them, which is
+                possible where it is a nest of single fields.
 
         Raises:
             PatternChanged: an entry is outside the nonzero pattern; the system is unusable then.
@@ -105,12 +117,15 @@ class System:
             for rc, block in scene.blocks.items():
                 if block.data.size and rc not in self.blocks:
                     raise PatternChanged(f"block {rc} was empty")
-            for rc, matrix in self.blocks.items():
-                _set_values(matrix, rc, scene.blocks.get(rc))
+        outgrown = self._set_blocks(scene)
+        anew = self._make_anew(scene, outgrown, grow and self.mat_type == "nest" and self.J.getType() == "nest")
         self.problem.contact_state = scene.contact_state
+        self.row_scale = dict.fromkeys(self.layout.fields, 1.0)
         for matrix in self.blocks.values():
             matrix.assemble()
-        if self.J.getType() == "nest":
+        if anew:
+            self.J = field_nest(self.members, self.blocks, self.layout)
+        elif self.J.getType() == "nest":
             for k, (_, fields) in enumerate(self.members):
                 if len(fields) > 1:
                     one_matrix(fields, self.blocks, self.layout, out=self.J.getNestSubMatrix(k, k))
@@ -119,9 +134,41 @@ class System:
             one_matrix(self.layout.fields, self.blocks, self.layout, out=self.J)
         self.set_rhs(scene.rhs)
 
+    def scale_rows(self, factors: Mapping[str, float]) -> None:
+        """Multiply the equations of each field by a number, which changes no solution.
+
+        Collective. Matrix, right-hand side and fixed-stress coefficients, all in place; `update` undoes it. The fields
+        of mechanics must share a factor where they are one matrix. Powers of two cause no rounding.
+        """
+        for (r, _), block in self.blocks.items():
+            block.scale(factors[r])
+        if self.J.getType() == "nest":
+            for k, (_, fields) in enumerate(self.members):
+                if len(fields) > 1:
+                    self.J.getNestSubMatrix(k, k).scale(factors[fields[0]])
+            self.J.stateIncrease()
+        elif len(self.layout.fields) > 1:
+            rows = self.b.duplicate()
+            rows.setArray(np.concatenate([np.full(self.layout.sizes(f)[0], factors[f]) for f in self.layout.fields]))
+            self.J.diagonalScale(rows)
+            rows.destroy()
+        if self.problem.fixed_stress is not None:
+            self.problem.fixed_stress = self.problem.fixed_stress * np.array([factors["mass"], 1.0])
+        self.b.setArray(np.concatenate([factors[f] * v for f, v in self.by_field(self.b).items()]))
+        self.row_scale = {f: factors[f] * scale for f, scale in self.row_scale.items()}
+
+    def destroy(self) -> None:
+        """Free PETSc's objects. Collective; after the KSP that uses them.
+
+        The DM has to go by name: where PETSc 3.18 frees one that Python has let go of, all that the DM's Python
+        context holds, the matrices among it, is never freed.
+        """
+        for thing in (self.dm, self.J, self.b, *self.blocks.values()):
+            thing.destroy()
+
     def set_rhs(self, rhs: Mapping[str, NDArray[np.float64]]) -> None:
         """Set the right-hand side from the local rows of each field."""
-        self.b.setArray(np.concatenate([rhs[f] for f in self.layout.fields]))
+        self.b.setArray(np.concatenate([self.row_scale[f] * rhs[f] for f in self.layout.fields]))
 
     def by_field(self, vector: PETSc.Vec) -> FieldArrays:
         """The local rows of each field of a vector, copied."""
@@ -133,8 +180,8 @@ class System:
         squares = np.array([np.vdot(arrays[f], arrays[f]) for f in self.layout.fields])
         return dict(zip(self.layout.fields, np.sqrt(self.layout.comm.allreduce(squares)).tolist(), strict=True))
 
-    def rounding_level(self, solution: Mapping[str, NDArray[np.float64]]) -> float:
-        """Unit roundoff times the norm of |J| |x| + |b|: below this a residual says nothing.
+    def magnitudes(self, solution: Mapping[str, NDArray[np.float64]]) -> dict[str, float]:
+        """Norm of |J| |x| + |b| per field: what the terms of its equations amount to before they cancel.
 
         Collective. Gathers the solution on every rank and copies one block at a time.
         """
@@ -145,8 +192,11 @@ class System:
             for first, last, start, stop in slabs(indptr, SLAB):
                 sums = np.concatenate([[0.0], np.cumsum(np.abs(values[start:stop]) * whole[c][indices[start:stop]])])
                 magnitude[r][first:last] += np.diff(sums[indptr[first : last + 1] - start])
-        norms = self.field_norms(magnitude)
-        return float(np.finfo(np.float64).eps * np.linalg.norm(list(norms.values())))
+        return self.field_norms(magnitude)
+
+    def rounding_level(self, solution: Mapping[str, NDArray[np.float64]]) -> float:
+        """Unit roundoff times the norm of |J| |x| + |b|: below this a residual says nothing. Collective."""
+        return float(np.finfo(np.float64).eps * np.linalg.norm(list(self.magnitudes(solution).values())))
 
     def gather(self, arrays: Mapping[str, NDArray[np.float64]]) -> FieldArrays | None:
         """All rows of each field in the scene's numbering, on rank 0; None elsewhere. Collective."""
@@ -154,6 +204,45 @@ class System:
         if parts is None:
             return None
         return {f: self.layout.to_scene(f, np.concatenate([part[f] for part in parts])) for f in self.layout.fields}
+
+    def _set_blocks(self, scene: Scene) -> dict[tuple[str, str], PatternChanged]:
+        """Give blocks the values of a scene; those that have no place for all of them. Collective."""
+        equal = self._equal_blocks(scene)
+        outgrown = {}
+        for rc, matrix in self.blocks.items():
+            if rc in equal:
+                if self.row_scale[rc[0]] != 1.0:
+                    matrix.scale(1.0 / self.row_scale[rc[0]])
+                continue
+            try:
+                _set_values(matrix, rc, scene.blocks.get(rc))
+            except PatternChanged as e:
+                outgrown[rc] = e
+        return outgrown
+
+    def _make_anew(self, scene: Scene, outgrown: Mapping[tuple[str, str], PatternChanged], possible: bool) -> bool:
+        """Make blocks anew that have new entries on some rank; whether there are any. Collective.
+
+        Raises:
+            PatternChanged: there are some, and it is not possible.
+        """
+        with together(self.layout.comm):
+            if outgrown and not possible:
+                raise next(iter(outgrown.values()))
+        anew = np.array([rc in outgrown for rc in self.blocks])
+        self.layout.comm.Allreduce(MPI.IN_PLACE, anew, op=MPI.LOR)
+        for rc, new in zip(self.blocks, anew, strict=True):
+            if new:
+                self.blocks[rc] = self._create_block(*rc, scene.blocks.get(rc))
+        return bool(anew.any())
+
+    def _equal_blocks(self, scene: Scene) -> set[tuple[str, str]]:
+        """Blocks that have the values of the last update on all ranks, as those of linear elasticity do. Collective."""
+        latest = [_Fingerprint.of(scene.blocks.get(rc)) for rc in self.blocks]
+        same = np.array([new.equals(old) for new, old in zip(latest, self._fingerprints, strict=True)])
+        self.layout.comm.Allreduce(MPI.IN_PLACE, same, op=MPI.LAND)
+        self._fingerprints = latest
+        return {rc for rc, equal in zip(self.blocks, same, strict=True) if equal}
 
     def _check(self, scene: Scene) -> None:
         for name in self.layout.fields:
@@ -168,6 +257,15 @@ class System:
                     f"block ({r}, {c}): {block.data.size} entries on a rank; "
                     "use more ranks, or a PETSc with 64-bit indices"
                 )
+        rows = self.layout.sizes("momentum")[0] if "momentum" in self.layout.fields else 0
+        stiffness = scene.blocks.get(("momentum", "momentum"))
+        filled = np.diff(stiffness.indptr) > 0 if stiffness is not None else np.zeros(rows, dtype=bool)
+        if rows and not filled.all():  # hypre 2.26 crashes on such a row
+            first = scene.row_range("momentum")[0] + int(np.argmin(filled))
+            raise SceneError(
+                f"momentum: {rows - np.count_nonzero(filled)} rows of the block (momentum, momentum) have no entry, "
+                f"the first is {first}; export the scene again with its elastic stiffness"
+            )
 
     def _create_block(self, r: str, c: str, block: CSR | None) -> PETSc.Mat:
         sizes = (self.layout.sizes(r), self.layout.sizes(c))
@@ -176,6 +274,34 @@ class System:
         bsize = (self.layout.block_size(r), self.layout.block_size(c))
         csr = (_petsc_int(block.indptr), _petsc_int(block.indices), block.data)
         return PETSc.Mat().createAIJ(sizes, bsize=bsize, csr=csr, comm=self.layout.comm)
+
+
+@dataclass(frozen=True)
+class _Fingerprint:
+    """Tells whether a block is the same as an earlier one, without a copy of its values.
+
+    Attributes:
+        pattern: `indptr` and `indices`, by reference: blocks of one pattern usually share them.
+        values: digest of the values.
+    """
+
+    pattern: tuple[Integers, ...]
+    values: bytes
+
+    @classmethod
+    def of(cls, block: CSR | None) -> _Fingerprint:
+        """Of a block, which is empty where it is None."""
+        if block is None:
+            return cls((), b"")
+        values = hashlib.sha256(np.ascontiguousarray(block.data).data, usedforsecurity=False)
+        return cls((block.indptr, block.indices), values.digest())
+
+    def equals(self, other: _Fingerprint | None) -> bool:
+        """Whether the blocks are the same."""
+        if other is None or self.values != other.values or len(self.pattern) != len(other.pattern):
+            return False
+        pairs = zip(self.pattern, other.pattern, strict=True)
+        return all(mine is theirs or np.array_equal(mine, theirs) for mine, theirs in pairs)
 
 
 def _petsc_int(values: Integers) -> Integers:

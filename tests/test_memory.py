@@ -135,6 +135,27 @@ def build_and_print() -> None:
     solver.destroy()
 
 
+@linux
+def test_nothing_is_left_of_a_destroyed_solver(returns_freed: None):
+    assert abs(float(in_own_process("destroy_and_print"))) < 0.2, "1 is a matrix for each solver"
+
+
+def destroy_and_print() -> None:
+    """Bytes that three solvers leave behind, made and destroyed one after the other, in matrices."""
+    memory.return_freed()
+    held = []
+    for _ in range(5):
+        scene = banded_scene(rows=6_000, width=100)
+        scene.sizes["mass"] = 3
+        scene.rhs["mass"] = np.ones(3)
+        identity = CSR(np.arange(4, dtype=PETSc.IntType), np.arange(3, dtype=PETSc.IntType), np.ones(3))
+        scene.blocks["mass", "mass"] = identity
+        size = 12 * scene.blocks["momentum", "momentum"].data.size
+        Solver(scene, MPI.COMM_SELF, release=True).destroy()
+        held.append(memory.held())
+    print((held[-1] - held[1]) / 3 / size)
+
+
 @pytest.mark.mpi
 @pytest.mark.parametrize("name", ["model1", "model3"])
 def test_storage_of_mechanics_changes_nothing(name: str, clean_options: PETSc.Options):

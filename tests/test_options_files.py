@@ -56,7 +56,7 @@ def test_every_level_names_its_ksp(file):
             name = prefixes[-1] + line[0][1:]
             pcs += [name.removesuffix("pc_type")] if name.endswith("pc_type") else []
             ksps += [name.removesuffix("ksp_type")] if name.endswith("ksp_type") else []
-    inner_of_python_pc = {p for p in pcs if p.endswith(("qr_", "fs_"))}
+    inner_of_python_pc = {p for p in pcs if p.endswith(("qr_", "fs_", "component_"))}
     assert set(pcs) - inner_of_python_pc == set(ksps)
 
 

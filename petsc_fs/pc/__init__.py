@@ -1,6 +1,7 @@
 """Preconditioners that PETSc lacks, for `-pc_type python -pc_python_type petsc_fs.pc.NAME`."""
 
+from petsc_fs.pc.component_sweep import ComponentSweep
 from petsc_fs.pc.contact_transform import ContactTransform
 from petsc_fs.pc.fixed_stress import FixedStress
 
-__all__ = ["ContactTransform", "FixedStress"]
+__all__ = ["ComponentSweep", "ContactTransform", "FixedStress"]

@@ -33,8 +33,9 @@ class ContactTransform(WrapperPC):
 
     Options, with the prefix of this PC:
         -qr_side right|left|none: the transformation.
-        -qr_mechanics_mat_type aij|hypre: storage of the block of mechanics; hypre, the default where the
-            options give that field a PCHYPRE, saves PCHYPRE its own copy.
+        -qr_mechanics_mat_type aij|hypre|nest: storage of the block of mechanics; hypre, the default where the
+            options give that field a PCHYPRE, saves PCHYPRE its own copy; nest, the default where they give
+            it a `ComponentSweep`, makes no copy at all.
         -qr_pc_type, ...: the inner PC, whose fields are contact, mechanics, intf_flow, mass.
 
     The operator must be a MatNest over the five fields, or those of them that a scene has.
@@ -65,8 +66,7 @@ class ContactTransform(WrapperPC):
         self._contact, self._intf_force = nest.getNestISs()[0][:2]
         inner_members = merge_mechanics(names)
         inner_problem = replace(problem, blocks=eliminated)
-        kinds = ("hypre", "aij") if _hypre_suffices(pc) else ("aij", "hypre")
-        mat_type = choice(pc, "qr_mechanics_mat_type", kinds)
+        mat_type = choice(pc, "qr_mechanics_mat_type", _storages(pc))
         matrix = field_nest(inner_members, eliminated, problem.layout, mat_type)
         return matrix, field_dm(inner_problem, inner_members)
 
@@ -123,18 +123,25 @@ class ContactTransform(WrapperPC):
         return f"inner PC on {where} with the exact Schur complement of contact"
 
 
-def _hypre_suffices(pc: PETSc.PC) -> bool:
-    """Whether the inner solver only ever multiplies with the block of mechanics and hands it to PCHYPRE.
+def _storages(pc: PETSc.PC) -> tuple[str, ...]:
+    """Storages for the block of mechanics, the best for the inner solver first. Local.
 
-    Schur complements that PETSc assembles multiply matrices, which it cannot in hypre's storage. Local.
+    Others than AIJ serve where the inner solver only ever hands the block to a PC that knows them. Schur
+    complements that PETSc assembles multiply matrices, which it can in AIJ only.
     """
     prefix = (pc.getOptionsPrefix() or "") + ContactTransform.prefix
-    leaf = "fieldsplit_mechanics_pc_type"
+    leaf = "fieldsplit_mechanics_"
     chosen = {k: str(v) for k, v in PETSc.Options().getAll().items() if k.startswith(prefix)}
-    levels = [k.removesuffix(leaf) for k in chosen if k.endswith(leaf)]
+    levels = [k.removesuffix(f"{leaf}pc_type") for k in chosen if k.endswith(f"{leaf}pc_type")]
     assembling = {chosen.get(level + "pc_fieldsplit_schur_precondition") for level in levels} & {"selfp", "full"}
-    wanted = bool(levels) and all(chosen[level + leaf] == "hypre" for level in levels)
-    return wanted and not assembling and bool(PETSc.Sys.hasExternalPackage("hypre"))
+    kinds = {chosen[f"{level}{leaf}pc_type"] for level in levels}
+    best = "aij"
+    if not assembling and kinds == {"hypre"} and PETSc.Sys.hasExternalPackage("hypre"):
+        best = "hypre"
+    elif not assembling and kinds == {"python"}:
+        types = {chosen.get(f"{level}{leaf}pc_python_type") for level in levels}
+        best = "nest" if types == {"petsc_fs.pc.ComponentSweep"} else "aij"
+    return (best, *(kind for kind in ("aij", "hypre", "nest") if kind != best))
 
 
 def add_product(M: PETSc.Mat | None, A: PETSc.Mat, B: PETSc.Mat) -> PETSc.Mat:

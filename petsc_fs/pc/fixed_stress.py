@@ -74,6 +74,7 @@ class FixedStress(WrapperPC):
 def add_to_diagonal(A: PETSc.Mat, diagonal: NDArray[np.float64]) -> PETSc.Mat:
     """A + diag as a new matrix; `diagonal` has the local rows."""
     S = A.duplicate(copy=True)
+    S.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)  # the diagonal may be missing from the pattern
     vector = S.createVecLeft()
     vector.setArray(diagonal)
     S.setDiagonal(vector, addv=PETSc.InsertMode.ADD_VALUES)

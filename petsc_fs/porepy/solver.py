@@ -29,6 +29,7 @@ from petsc_fs import options, server
 from petsc_fs.errors import SceneError, SolveError, UsageError
 from petsc_fs.fields import in_order
 from petsc_fs.forcing import EisenstatWalker, EisenstatWalkerParameters
+from petsc_fs.memory import return_freed
 from petsc_fs.pattern import UnionPattern
 from petsc_fs.scene import Scene, contact_state_counts
 from petsc_fs.tree import CANONICAL, Facts, Tree, smallest_tree
@@ -174,6 +175,7 @@ class FieldSplitSolver:
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._client = server.join()
+        return_freed()  # or the process grows with each Newton step: PorePy frees what malloc then keeps
         super().__init__(*args, **kwargs)
         self.linear_solves = []
         self._adapter: Adapter | None = None
