@@ -27,12 +27,13 @@ if TYPE_CHECKING:
     from petsc_fs.solver import Result, Solver
     from petsc_fs.tree import Tree
 
-TAKES_PETSC = ("solve", "compare", "run")
+TAKES_PETSC = ("solve", "compare", "run", "stress")
 """Commands that pass PETSc's options on."""
 
 MODULES = {
     "compare": ("measure error against seconds of options files, and draw it", "petsc_fs.compare"),
     "sweep": ("search a space of PETSc options for better options files", "petsc_fs.sweep"),
+    "stress": ("solve extreme scenes by every options file, and say which answers were right", "petsc_fs.stress"),
     "run": ("run a PorePy model with petsc_fs as its linear solver", "petsc_fs.porepy.simulation"),
     "discretisation": ("measure discretisation error against run time and tolerance", "petsc_fs.porepy.discretisation"),
     "export": ("run a PorePy model and write its linear systems as scenes", "petsc_fs.porepy.export"),

@@ -19,6 +19,7 @@ def analytic_coefficients(scene: Scene) -> NDArray[np.float64] | None:
       and l_min = alpha^2 / (4 G + 2 lambda);
     - fractures: first = l_frac V rho / dt, second = 1, with
       l_frac = [u]_n alpha^2 c_f / (lambda (1/M + phi c_f)), 1/M = (alpha - phi)(1 - alpha) / (lambda + 2 G / 3);
+      and c_f / (1/M + phi c_f) = 1 / phi where neither rock nor fluid stores anything;
     - intersections: 0, as they do not touch the momentum balance.
 
     The paper has t = 1; its published code has t = 0.6.
@@ -47,7 +48,9 @@ def analytic_coefficients(scene: Scene) -> NDArray[np.float64] | None:
         first[rock] = (l_min * scale)[rock]
         second[rock] = ((4 * G + 2 * lame) / (2 * G / scene.dimension + lame))[rock]
         inverse_biot_modulus = (alpha - phi) * (1 - alpha) / (lame + 2 * G / 3)
-        l_frac = jump * alpha**2 * c_f / (lame * (inverse_biot_modulus + phi * c_f))
+        storage = inverse_biot_modulus + phi * c_f
+        share = np.where(storage == 0, 1 / phi, c_f / storage)  # without any storage its limit for 1/M = 0, c_f -> 0
+        l_frac = jump * alpha**2 * share / lame
         first[fracture] = (l_frac * scale)[fracture]
     result = np.column_stack([first, second])
     if not np.isfinite(result).all():

@@ -237,7 +237,7 @@ def explained(path: Path) -> Iterator[None]:
         raise type(e)(f"{path}: {e}") from e
     except KeyError as e:
         raise SceneError(f"{path}: the scene is incomplete: {e.args[0]}") from e
-    except (OSError, RuntimeError, TypeError, ValueError, AttributeError, IndexError) as e:
+    except (OSError, RuntimeError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as e:
         raise SceneError(f"{path}: the scene is damaged ({e}); copy or export it again") from e
 
 

@@ -15,6 +15,7 @@ and, where the solve came to an end (kinds converged, stagnated, diverged and un
     iterations         of the outer Krylov method
     reason             PETSc's name for why it stopped, for example "CONVERGED_RTOL"
     limited_by_rounding  whether the residual cannot be told from rounding, though the tolerance is not met
+    tolerance          what the true residual was held against
     read_seconds       reading the scene: the same for all records of a scene and process
     setup_seconds      PETSc's matrices and the preconditioner: once for all tolerances of a repetition
     solve_seconds      the Krylov method
@@ -80,6 +81,7 @@ EMPTY: Record = dict.fromkeys(
         "iterations",
         "reason",
         "limited_by_rounding",
+        "tolerance",
         "read_seconds",
         "setup_seconds",
         "solve_seconds",
@@ -131,6 +133,7 @@ class Job:
         history: whether the last solve of each scene is done once more for its errors by iteration.
         time_limit: seconds for each step: start and reading, set-up, one solve, errors.
         memory_limit: bytes of address space that each rank may have; None for what the system allows.
+        keep_going: whether the process goes on with the next scene after an error that all ranks raised.
     """
 
     scenes: Sequence[str | os.PathLike[str]]
@@ -145,6 +148,7 @@ class Job:
     history: bool = False
     time_limit: float = 300.0
     memory_limit: int | None = None
+    keep_going: bool = False
 
     def to_json(self) -> str:
         """What the measured process reads."""

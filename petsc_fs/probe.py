@@ -55,7 +55,7 @@ def main() -> int:
     log = Log(Path(sys.argv[2]), comm)
     try:
         for scene in job.scenes:
-            if not Probe(job, scene, comm, log).run():
+            if not Probe(job, scene, comm, log).run() and not job.keep_going:
                 break
         log.phase("done")
     except Exception:
@@ -236,6 +236,7 @@ class Probe:
                         "iterations": result.iterations,
                         "reason": result.reason,
                         "limited_by_rounding": result.limited_by_rounding,
+                        "tolerance": result.tolerance,
                         "read_seconds": self.read_seconds,
                         "setup_seconds": setup_seconds,
                         "solve_seconds": self._slowest(result.solve_seconds),

@@ -51,6 +51,7 @@ def solve_table(scene: Scene, report: dict[str, Any]) -> str:
         f"{report['options_file'] or 'the smallest solver for the scene'}"
         f" on {report['ranks']} rank{'s' if report['ranks'] > 1 else ''}",
         *report["left_out"],
+        *report.get("notes", ()),
         ", ".join(f"{what} {report[key]:.3f} s" for what, key in PHASES),
         memory.text(report["memory_bytes"]),
     ]
