@@ -19,7 +19,7 @@ from petsc_fs.porepy.paper_tables import (
     paper,
     refinements,
 )
-from petsc_fs.porepy.parity import TIMINGS, Measured, Results, mean_iterations
+from petsc_fs.porepy.parity import AS_PUBLISHED, TIMINGS, Measured, Results, mean_iterations
 from petsc_fs.porepy.parity_page import table, versions_text
 
 Runs = Mapping[str, Measured]
@@ -355,6 +355,8 @@ def _how(own: Runs, theirs: Runs) -> Iterator[str]:
         "two ranks."
     )
     yield "- Runs that [parity.md](parity.md) has too are taken from there."
+    judged = " ".join(f"-{name} {value}" for name, value in AS_PUBLISHED.items())
+    yield f"- Solutions were judged by their residual and no rows scaled, as in the published code: `{judged}`."
     for label, runs in (("petsc_fs", own), ("The published code", theirs)):
         for text in sorted({versions_text(m.versions) for m in runs.values()}):
             yield f"- {label} ran with {text}."
