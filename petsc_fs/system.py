@@ -124,6 +124,7 @@ class System:
         for matrix in self.blocks.values():
             matrix.assemble()
         if anew:
+            self.J.destroy()
             self.J = field_nest(self.members, self.blocks, self.layout)
         elif self.J.getType() == "nest":
             for k, (_, fields) in enumerate(self.members):
@@ -217,7 +218,7 @@ class System:
             try:
                 _set_values(matrix, rc, scene.blocks.get(rc))
             except PatternChanged as e:
-                outgrown[rc] = e
+                outgrown[rc] = e.with_traceback(None)  # whose frames would keep PETSc's objects, on some ranks only
         return outgrown
 
     def _make_anew(self, scene: Scene, outgrown: Mapping[tuple[str, str], PatternChanged], possible: bool) -> bool:
@@ -233,6 +234,7 @@ class System:
         self.layout.comm.Allreduce(MPI.IN_PLACE, anew, op=MPI.LOR)
         for rc, new in zip(self.blocks, anew, strict=True):
             if new:
+                self.blocks[rc].destroy()
                 self.blocks[rc] = self._create_block(*rc, scene.blocks.get(rc))
         return bool(anew.any())
 

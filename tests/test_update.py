@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mpi4py import MPI
+from programs import Program
 
 import petsc_fs
 from petsc_fs import hdf5
@@ -87,3 +88,39 @@ def test_a_block_with_a_new_entry_is_made_anew_and_no_other():
     assert {rc for rc, matrix in system.blocks.items() if matrix.handle != handles[rc]} == {CHANGING}
     k = layout.fields.index("contact")
     assert system.J.getNestSubMatrix(k, k).handle == system.blocks[CHANGING].handle
+
+
+GROWS_ON_ONE_RANK = """
+import petsc4py; petsc4py.init([])
+from pathlib import Path
+import numpy as np
+from mpi4py import MPI
+import petsc_fs
+from petsc_fs import hdf5, options
+from petsc_fs.layout import Layout
+from petsc_fs.scene import CSR
+from petsc_fs.solver import Solver
+
+comm = MPI.COMM_WORLD
+options.insert(options.find_options_file("contact_poromechanics.opts"))
+whole = hdf5.read(Path(petsc_fs.__path__[0]) / "scenes" / "model2.h5")
+layout = Layout.contiguous(comm, whole.dimension, whole.sizes)
+full, less = whole.restrict(layout), whole.restrict(layout)
+if comm.rank == 1:
+    b = less.blocks["contact", "contact"]
+    less.blocks["contact", "contact"] = CSR(np.minimum(b.indptr, b.indptr[-1] - 1), b.indices[:-1], b.data[:-1])
+solver = Solver(less, layout=layout)
+solver.update(full)
+print("rebuilds", solver.rebuilds, "converged", solver.solve().converged, flush=True)
+solver.destroy()
+del solver
+"""
+
+
+def test_program_ends_after_a_block_has_grown_on_one_rank(tmp_path: Path):
+    """An exception that one rank kept held PETSc's objects there, and the ranks waited for each other at exit."""
+    if comm.size > 1:
+        pytest.skip("starts ranks itself")
+    code, out, err = Program(tmp_path, GROWS_ON_ONE_RANK).end(30)
+    assert code == 0, err
+    assert out.splitlines().count("rebuilds 0 converged True") == 2
