@@ -49,8 +49,6 @@ ONE_CYCLE = 30
 """Iterations without success after which scaling is tried."""
 SPREAD = {"auto": 1e6, "always": 16.0}
 """Ratio of the magnitudes of fields' equations from which their rows are scaled."""
-EPS = float(np.finfo(np.float64).eps)
-SCALINGS = ("auto", "always", "none")
 
 
 @dataclass

@@ -110,3 +110,14 @@ def abort(text: str) -> None:
     """End all ranks, with a last word from this one."""
     os.write(stderr, f"\n--- rank {world.rank}\n{text}\n".encode())
     MPI.COMM_WORLD.Abort(1)
+
+
+@pytest.fixture
+def clean():
+    """Take the options of a test out of the database again."""
+    from petsc4py import PETSc
+
+    before = PETSc.Options().getAll()
+    yield
+    for name in set(PETSc.Options().getAll()) - set(before):
+        PETSc.Options().delValue(name)

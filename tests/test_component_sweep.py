@@ -23,15 +23,6 @@ DIRECT = {"component_pc_type": "lu", "component_pc_factor_mat_solver_type": "mum
 MECHANICS = ("intf_force", "momentum")
 
 
-@pytest.fixture
-def clean():
-    """Take the options of a test out of the database again."""
-    before = PETSc.Options().getAll()
-    yield
-    for name in set(PETSc.Options().getAll()) - set(before):
-        PETSc.Options().delValue(name)
-
-
 def load(name: str) -> Scene:
     return hdf5.read(SCENES / f"{name}.h5")
 

@@ -91,15 +91,6 @@ INNER_CONTACT = {
 }
 
 
-@pytest.fixture
-def clean():
-    """Take the options of a test out of the database again."""
-    before = PETSc.Options().getAll()
-    yield
-    for name in set(PETSc.Options().getAll()) - set(before):
-        PETSc.Options().delValue(name)
-
-
 # Theorems
 
 
