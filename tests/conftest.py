@@ -114,10 +114,12 @@ def abort(text: str) -> None:
 
 @pytest.fixture
 def clean():
-    """Take the options of a test out of the database again."""
+    """PETSc's options database, as it was before once the test is over."""
     from petsc4py import PETSc
 
-    before = PETSc.Options().getAll()
-    yield
-    for name in set(PETSc.Options().getAll()) - set(before):
-        PETSc.Options().delValue(name)
+    database = PETSc.Options()
+    before = database.getAll()
+    yield database
+    for name in database.getAll():
+        if name not in before:
+            database.delValue(name)

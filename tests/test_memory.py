@@ -23,16 +23,6 @@ linux = pytest.mark.skipif(not memory.CLEAR.exists(), reason="needs Linux's /pro
 
 
 @pytest.fixture
-def clean_options():
-    database = PETSc.Options()
-    before = database.getAll()
-    yield database
-    for name in database.getAll():
-        if name not in before:
-            database.delValue(name)
-
-
-@pytest.fixture
 def returns_freed():
     if not memory.return_freed():
         pytest.skip("needs glibc")
@@ -158,14 +148,14 @@ def destroy_and_print() -> None:
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("name", ["model1", "model3"])
-def test_storage_of_mechanics_changes_nothing(name: str, clean_options: PETSc.Options):
+def test_storage_of_mechanics_changes_nothing(name: str, clean: PETSc.Options):
     options.insert(options.find_options_file("contact_poromechanics.opts"))
     scene = hdf5.read(SCENES / f"{name}.h5")
-    clean_options.setValue("ksp_max_it", 12)
+    clean.setValue("ksp_max_it", 12)
     histories, types = [], []
     for mat_type in (None, "aij"):
         if mat_type:
-            clean_options.setValue("qr_mechanics_mat_type", mat_type)
+            clean.setValue("qr_mechanics_mat_type", mat_type)
         solver = Solver(scene)
         solver.solve()
         histories.append(solver.history())
@@ -178,14 +168,14 @@ def test_storage_of_mechanics_changes_nothing(name: str, clean_options: PETSc.Op
 
 
 @pytest.mark.parametrize("change", [{"pc_type": "gamg"}, {"precondition": "selfp"}])
-def test_storage_of_mechanics_stays_aij_where_hypre_would_not_do(change: dict[str, str], clean_options: PETSc.Options):
+def test_storage_of_mechanics_stays_aij_where_hypre_would_not_do(change: dict[str, str], clean: PETSc.Options):
     options.insert(options.find_options_file("contact_poromechanics.opts"))
     names = {
         "pc_type": "qr_fieldsplit_1_fieldsplit_mechanics_pc_type",
         "precondition": "qr_fieldsplit_1_pc_fieldsplit_schur_precondition",
     }
     for what, value in change.items():
-        clean_options.setValue(names[what], value)
+        clean.setValue(names[what], value)
     solver = Solver(hdf5.read(SCENES / "model1.h5"), MPI.COMM_SELF)
     try:
         solver.set_up()

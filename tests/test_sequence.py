@@ -11,7 +11,7 @@ import pytest
 from mpi4py import MPI
 from sample import CELLS, SCENES, assert_same, full_scene
 
-from petsc_fs import cli, hdf5, options, sequence
+from petsc_fs import cli, hdf5, sequence
 from petsc_fs.errors import SceneError, UsageError
 from petsc_fs.layout import Layout
 from petsc_fs.replay import Player
@@ -225,18 +225,8 @@ def test_choices_of_steps_that_are_none(text):
 # Replay
 
 
-@pytest.fixture
-def clean_options():
-    """PETSc's options database as it was, after a test that fills it."""
-    from petsc4py import PETSc
-
-    before = PETSc.Options().getAll()
-    yield
-    options.delete_all(name for name in PETSc.Options().getAll() if name not in before)
-
-
 @pytest.mark.mpi
-def test_replay_needs_as_many_iterations_as_the_run(clean_options):
+def test_replay_needs_as_many_iterations_as_the_run(clean):
     """The run was on one rank; on more, the multigrid of hypre is another one."""
     player = Player(BUNDLED, MPI.COMM_WORLD, smallest_tree=True)
     records = [player.play(step) for step in sequence.read_contents(BUNDLED).steps]
@@ -248,7 +238,7 @@ def test_replay_needs_as_many_iterations_as_the_run(clean_options):
 
 
 @pytest.mark.mpi
-def test_replay_keeps_its_solver_and_finds_the_solution_of_each_step(clean_options):
+def test_replay_keeps_its_solver_and_finds_the_solution_of_each_step(clean):
     from petsc_fs.solver import Solver
 
     comm = MPI.COMM_WORLD
@@ -268,7 +258,7 @@ def test_replay_keeps_its_solver_and_finds_the_solution_of_each_step(clean_optio
     player.solver.destroy()
 
 
-def test_steps_of_another_size_get_another_solver(clean_options, tmp_path):
+def test_steps_of_another_size_get_another_solver(clean, tmp_path):
     writer = Writer(tmp_path / "two.h5")
     for name in ("flow.h5", "contact.h5", "flow.h5"):
         writer.append(hdf5.read(SCENES / name))
@@ -282,7 +272,7 @@ def test_steps_of_another_size_get_another_solver(clean_options, tmp_path):
     player.solver.destroy()
 
 
-def test_the_tolerance_of_an_inexact_run_is_replayed(clean_options, tmp_path):
+def test_the_tolerance_of_an_inexact_run_is_replayed(clean, tmp_path):
     writer = Writer(tmp_path / "inexact.h5")
     scene = sequence.read(BUNDLED, 0)
     for run in ({}, {"forcing": 1e-2}, {"forcing": 1e-12}):
@@ -304,7 +294,7 @@ def call(capsys, *arguments, code=0):
     return captured.out if code == 0 else captured.err
 
 
-def test_solve_replays_and_reports(clean_options, capsys, tmp_path):
+def test_solve_replays_and_reports(clean, capsys, tmp_path):
     out = call(capsys, "solve", "model2_run.h5", "--report", tmp_path / "r.json")
     report = json.loads((tmp_path / "r.json").read_text())
     contents = sequence.read_contents(BUNDLED)
@@ -316,7 +306,7 @@ def test_solve_replays_and_reports(clean_options, capsys, tmp_path):
     assert "in run" in out
 
 
-def test_solve_of_one_step_saves_its_solution(clean_options, capsys, tmp_path):
+def test_solve_of_one_step_saves_its_solution(clean, capsys, tmp_path):
     call(capsys, "solve", "model2_run.h5", "--steps", "1", "--save", tmp_path / "x.h5")
     with h5py.File(tmp_path / "x.h5") as file:
         assert {name: values.size for name, values in file.items()} == sequence.read_contents(BUNDLED).steps[1].sizes

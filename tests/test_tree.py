@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from test_pc import clean, dense, gathered, local_order, python_pc, system_of  # noqa: F401
+from test_pc import dense, gathered, local_order, python_pc, system_of
 from test_solver import load, unequal
 
 import petsc_fs
@@ -208,7 +208,7 @@ class Solved:
 
 
 @pytest.fixture
-def solve(clean, shared_tmp_path):  # noqa: F811
+def solve(clean, shared_tmp_path):
     """Solve a scene by its smallest tree."""
     return lambda scene, **more: Solved(scene, shared_tmp_path, **more)
 
@@ -254,7 +254,7 @@ def test_open_fractures_need_neither_transformation_nor_schur_complement(solve, 
 
 
 @pytest.mark.mpi
-def test_schur_complement_of_open_fractures_is_the_jacobian(clean):  # noqa: F811
+def test_schur_complement_of_open_fractures_is_the_jacobian(clean):
     """S^1 = J where J_12 = 0: what ContactTransform would compute there changes nothing."""
     system = system_of(all_open(load("contact")))
     pc = python_pc(system, "ContactTransform", "o_", qr_pc_type="none")
