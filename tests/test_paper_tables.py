@@ -134,6 +134,9 @@ def test_results_are_resumed(tmp_path, fake_children):
     assert len(parity.read(results)["petsc_fs"]["model1_g1"].history) == 6
     assert paper_tables.make_runs(["model1_g1"], results, Plan(launcher=("env",)), lines.append) == []
     assert set(parity.read(results)["petsc_fs: env"]) == {"model1_g1"}
+    published = Plan(published_code=tmp_path, again_by="direct.opts", launcher=("env",))
+    assert paper_tables.make_runs(["model1_g1"], results, published, lines.append) == []
+    assert set(parity.read(results)["published_code by direct.opts: env"]) == {"model1_g1"}
 
 
 def test_failed_run(tmp_path, fake_children):

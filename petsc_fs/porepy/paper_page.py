@@ -84,10 +84,11 @@ preconditioned residual. The paper has no such table.
 SECONDS = """\
 In one run, each linear system of the published code's simulation is solved by both, one after the other, and the one
 that goes first changes from system to system. "Published code" is all of its `solve_linear_system`, on one rank;
-"petsc_fs" is all of `FieldSplitSolver.solve_linear_system`, which keeps its solver between Newton steps as in any
-simulation with it: taking the Jacobian apart by fields and bringing it to PETSc (transfer), building the matrices and
-setting the preconditioner up, the Krylov method, and the way back. Where the seconds of the clock are more than those
-of the processor, other programs ran on the machine's two cores at the same time. Ratios are published code to petsc_fs.
+"petsc_fs" is all of `FieldSplitSolver.solve_linear_system`, with the same sub-solvers or by the file that is named. It
+keeps its solver between Newton steps as in any simulation with it: taking the Jacobian apart by fields and bringing it
+to PETSc (transfer), building the matrices and setting the preconditioner up, the Krylov method, and the way back. Where
+the seconds of the clock are more than those of the processor, other programs ran on the machine's two cores at the same
+time. Ratios are published code to petsc_fs.
 """
 
 
@@ -338,8 +339,10 @@ def _split(timed: Sequence[tuple[str, str, Measured]]) -> str:
 
 
 def _name(kind: str, name: str) -> str:
-    launcher = kind.partition(": ")[2]
-    return f"{name}, {f'`{launcher}`' if launcher else 'one rank'}"
+    what, _, launcher = kind.partition(": ")
+    file = what.partition(" by ")[2]
+    parts = [name, f"`{launcher}`" if launcher else "one rank", *([f"`{file}`"] if file else [])]
+    return ", ".join(parts)
 
 
 def _how(own: Runs, theirs: Runs) -> Iterator[str]:
@@ -352,7 +355,7 @@ def _how(own: Runs, theirs: Runs) -> Iterator[str]:
     yield (
         "- `--published-code DIR` runs the published code in DIR instead, with the PorePy that Python finds, solves "
         'its systems again by petsc_fs and times both; with `--launcher "scripts/mpiexec -n 2"` petsc_fs does so on '
-        "two ranks."
+        "two ranks, and with `--again-by FILE` by another options file."
     )
     yield "- Runs that [parity.md](parity.md) has too are taken from there."
     judged = " ".join(f"-{name} {value}" for name, value in AS_PUBLISHED.items())

@@ -148,6 +148,7 @@ class Plan:
         limit: seconds for each run.
         launcher: command before that of each run, such as ("mpiexec", "-n", "2").
         petsc: options of PETSc.
+        again_by: options file by which petsc_fs solves the systems of the published code; None: that of the run.
     """
 
     published_code: Path | None = None
@@ -155,11 +156,13 @@ class Plan:
     limit: float = 3600.0
     launcher: tuple[str, ...] = ()
     petsc: tuple[str, ...] = ()
+    again_by: str | None = None
 
 
 def kind_of(plan: Plan) -> str:
-    """Under which heading of the results the runs of a plan belong: what runs, and the launcher if there is one."""
+    """Under which heading of the results the runs of a plan belong: what runs, by which file, with which launcher."""
     kind = "petsc_fs" if plan.published_code is None else "published_code"
+    kind += f" by {plan.again_by}" if plan.again_by else ""
     return f"{kind}: {' '.join(plan.launcher)}" if plan.launcher else kind
 
 
@@ -231,6 +234,7 @@ def _make_run(name: str, plan: Plan) -> tuple[Measured | None, str]:
             "published_code": str(plan.published_code.resolve()) if plan.published_code else None,
             "time_steps": plan.time_steps,
             "petsc": plan.petsc,
+            "again_by": plan.again_by,
         }
         command = [*plan.launcher, sys.executable, "-c", CHILD, json.dumps(task)]
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -277,6 +281,7 @@ def child() -> None:
                 write_to_stderr,
                 time_steps=task["time_steps"],
                 keep=keep,
+                by=task["again_by"],
             )
         else:
             found = parity.measure(name, RUNS[name], write_to_stderr, time_steps=task["time_steps"], keep=keep)

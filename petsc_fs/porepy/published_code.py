@@ -62,6 +62,7 @@ def measure(
     *,
     time_steps: int | None = None,
     keep: Keep | None = None,
+    by: str | None = None,
 ) -> Measured:
     """Run the published code on one of its models and solve each system a second time, by `FieldSplitSolver`.
 
@@ -77,6 +78,7 @@ def measure(
         progress: called with a line of text per Newton step.
         time_steps: at most so many; None: all of the model.
         keep: called after each linear system with what there is so far, marked as unfinished.
+        by: options file of the second solve; None: that of the run, which does what the published code does.
 
     Raises:
         UsageError: the published code is not there, does not find what it needs, or has no such run.
@@ -93,7 +95,8 @@ def measure(
         linear_system: Any
 
         def __init__(self, params: dict[str, Any]) -> None:
-            super().__init__(params | {"petsc_fs_options_file": this.options_file, "petsc_fs_options_prefix": PREFIX})
+            file = by or this.options_file
+            super().__init__(params | {"petsc_fs_options_file": file, "petsc_fs_options_prefix": PREFIX})
 
         def solve_linear_system(self) -> NDArray[np.float64]:
             time_step = int(self.time_manager.time_index)
