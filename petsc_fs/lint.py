@@ -5,13 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from petsc_fs import hdf5, options
 from petsc_fs.errors import PetscFsError, UsageError
-
-if TYPE_CHECKING:
-    from petsc4py import PETSc
+from petsc_fs.levels import levels
 
 
 def lint(file: Path, scenes: Sequence[Path]) -> list[str]:
@@ -49,7 +46,7 @@ def lint(file: Path, scenes: Sequence[Path]) -> list[str]:
     except PetscFsError as e:
         return [*found, f"{file}: the solver cannot be set up: {e}"]
     useless = options.refused([name for name in options.unused() if name in chosen])
-    splits = set(_option_prefixes(solver.ksp.getPC()))
+    splits = {pc.getOptionsPrefix() or "" for pc in levels(solver.ksp.getPC())}
     for name in useless:
         missing = next((p for p in _split_prefixes(name) if p not in splits), None)
         if missing is None:
@@ -73,16 +70,3 @@ def _levels_without_types(chosen: Mapping[str, str | None]) -> Iterator[str]:
 def _split_prefixes(name: str) -> list[str]:
     """The prefixes of splits in an option name, outermost first."""
     return [name[: m.end()] for m in re.finditer(options.SPLIT, name)]
-
-
-def _option_prefixes(pc: PETSc.PC) -> Iterator[str]:
-    """Prefixes of a set-up PC and all PCs in it."""
-    yield pc.getOptionsPrefix() or ""
-    if pc.getType() == "fieldsplit":
-        for ksp in pc.getFieldSplitSubKSP():
-            yield from _option_prefixes(ksp.getPC())
-    elif pc.getType() == "python":
-        context = pc.getPythonContext()
-        inner = getattr(context, "inner", None)
-        for one in [inner] if inner is not None else getattr(context, "inners", ()):
-            yield from _option_prefixes(one)

@@ -12,7 +12,7 @@ import re
 import sys
 import sysconfig
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,6 +29,10 @@ OWN = (
     "petsc_fs_true_rtol",
     "petsc_fs_error_factor",
     "petsc_fs_scaling",
+    "petsc_fs_fallback",
+    "petsc_fs_regularize",
+    "petsc_fs_stagnation_window",
+    "petsc_fs_stagnation_ratio",
     "petsc_fs_reuse",
     "petsc_fs_reuse_changed",
     "petsc_fs_reuse_growth",
@@ -188,6 +192,28 @@ def delete_all(names: Iterable[str]) -> None:
 
     for name in names:
         PETSc.Options().delValue(name)
+
+
+@contextlib.contextmanager
+def replaced(values: Mapping[str, str | None]) -> Iterator[None]:
+    """Have options in PETSc's database within a block, in place of those that are set there. Local.
+
+    What was there before comes back, with its mark of having been asked for.
+    """
+    from petsc4py import PETSc
+
+    database = PETSc.Options()
+    before = database.getAll()
+    for name, value in values.items():
+        database.setValue(name, value)
+    try:
+        yield
+    finally:
+        for name in values:
+            if name in before:
+                database.setValue(name, before[name])
+            else:
+                database.delValue(name)
 
 
 def _text(path: Path) -> str:

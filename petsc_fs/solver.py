@@ -6,99 +6,47 @@ import atexit
 import gc
 import itertools
 import math
-import re
 import sys
 import time
 import weakref
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import replace
+from typing import Any, TypeVar
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from petsc_fs.diagnostics import broken_level, weakest_entries
-from petsc_fs.errors import PetscFsError, SolveError, UsageError, together
+from petsc_fs import options as database
+from petsc_fs.diagnostics import explain_weakness
+from petsc_fs.dm import one_matrix
+from petsc_fs.errors import PetscFsError, SceneError, SolveError, UsageError, together
+from petsc_fs.fallback import Fallback, NotApplicableError
 from petsc_fs.fields import MECHANICS
+from petsc_fs.judgement import EPS, ERROR_FACTOR, Criteria, Result, apply_preconditioner, judge
 from petsc_fs.layout import Layout
+from petsc_fs.levels import levels
 from petsc_fs.partition import chosen_kind, partition
+from petsc_fs.petsc_errors import brief, translate
+from petsc_fs.regularization import lift
 from petsc_fs.reuse import Reuse
 from petsc_fs.scene import Scene
+from petsc_fs.stagnation import Stagnation
 from petsc_fs.system import FieldArrays, PatternChanged, System
 
-REFUSALS = (62, 63, 86)
-"""PETSc's codes for a wrong argument, one out of range and an unknown type: what bad options give."""
+__all__ = ["Result", "Solver", "collect_garbage", "needed_data", "set_up_leaves"]
 
 MAT_TYPES = ("nest", "merged", "aij")
-ROUNDING_UNITS = 10
-"""A residual this many times the rounding level of the system cannot be told from zero."""
-
-ERROR_FACTOR = 1e7
-"""Estimated relative error of a field, per unit of tolerance, beyond which a solution does not count as one.
-
-Solutions of well-behaved scenes stay below 1e4.
-"""
-ENOUGH = 1e-3
-"""Estimated relative error that is never too large: rounding in the residual alone may amount to it."""
-EPS = float(np.finfo(np.float64).eps)
 SCALINGS = ("auto", "always", "none")
-USUAL = 1e-5
-"""Least singular values of J M^-1 above this occur where only the units of fields differ; they cast no doubt."""
+DOUBTFUL = 1e4
+"""Estimated relative error of a field, per unit of tolerance, from which a converged solve goes on."""
 ONE_CYCLE = 30
 """Iterations without success after which scaling is tried."""
 SPREAD = {"auto": 1e6, "always": 16.0}
 """Ratio of the magnitudes of fields' equations from which their rows are scaled."""
 
 
-@dataclass
-class Result:
-    """What a solve did.
-
-    Attributes:
-        iterations: of the outer Krylov method, restarts by -petsc_fs_restarts included.
-        converged: whether the true residual of the untransformed system meets the tolerance.
-        reason: PETSc's name of the reason why the Krylov method stopped.
-        true_relative_residual: |b - J x| / |b|.
-        rtol: relative tolerance that the Krylov method had.
-        tolerance: what `true_relative_residual` is held against: the larger of the relative
-            tolerance and the absolute one / |b|; or, where rounding forbids to meet that, ten units
-            of rounding, |J| |x| + |b| taken entry by entry.
-        limited_by_rounding: whether that last resort was needed.
-        estimated_error_by_field: |M^-1 (b - J x)| / |x| per field, with one application of the preconditioner M, over
-            the least singular value of J M^-1 that GMRES has seen, if that is below 1e-5: an estimate of the error that
-            no units and no other field can hide. Infinite where a field that is zero should not be. Empty where the
-            residual misses its tolerance.
-        error_tolerance: what these are held against; infinite where the tolerance is too loose to tell.
-        notes: what was done beyond the options, and what is wrong, a line each.
-        residual_by_field: |b - J x| restricted to each field / |b|.
-        error_by_field: |x - reference| / |reference| per field, where a reference is known; the
-            absolute error where the reference is zero.
-        setup_seconds: building PETSc's matrices and setting the preconditioner up, for this solve.
-        solve_seconds: the Krylov method.
-        solution: local rows of each field, in the order of the layout; `System.gather` gives the scene's.
-    """
-
-    iterations: int
-    converged: bool
-    reason: str
-    true_relative_residual: float
-    tolerance: float
-    limited_by_rounding: bool
-    residual_by_field: dict[str, float]
-    error_by_field: dict[str, float]
-    setup_seconds: float
-    solve_seconds: float
-    solution: FieldArrays = field(repr=False)
-    rtol: float = 0.0
-    estimated_error_by_field: dict[str, float] = field(default_factory=dict)
-    error_tolerance: float = math.inf
-    notes: tuple[str, ...] = ()
-
-    def report(self) -> dict[str, Any]:
-        """All of it but the solution, for JSON."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "solution"}
-
+AnError = TypeVar("AnError", bound=PetscFsError)
 
 _numbers = itertools.count()
 _live: weakref.WeakSet[Solver] = weakref.WeakSet()
@@ -133,6 +81,13 @@ class Solver:
             field's estimated error is too large though the residual is small; one of the restarts. always: first of
             all, by what one application of the preconditioner says. Either way the preconditioner is set up once
             more, and the scales are kept for further scenes.
+        -petsc_fs_fallback LIST: stronger preconditioners that are tried in turn where a solve has not converged, or
+            failed: names of `petsc_fs.fallback.RUNGS` with commas between them; default none. Each adds to those
+            before it. Further solves with the same matrix stay on the rung that helped. The next matrix starts with
+            the options as given again, unless two matrices in a row needed a rung: then on that.
+        -petsc_fs_regularize EPS: blocks that the preconditioner divides by, and that are weaker than EPS of what is
+            usual, are lifted to that, in the preconditioner only; see `petsc_fs.regularization`. Default 0: none.
+        -petsc_fs_stagnation_window, _ratio: see `petsc_fs.stagnation.Stagnation`.
 
     Attributes:
         rtol: relative tolerance of the Krylov method, from the options.
@@ -168,6 +123,7 @@ class Solver:
         started = time.perf_counter()
         self.prefix = prefix
         self.ksp: Any = None
+        self._preconditioned: Any = None  # the matrix of the preconditioner, where it is not the Jacobian
         self._number = next(_numbers)
         _live.add(self)
         whole = layout or self._layout_of(scene, mpi)
@@ -182,7 +138,16 @@ class Solver:
             scene.blocks.clear()
         self._storage = {"mat_type": mat_type, "release": True, **needed_data(prefix)}
         self.reuse = Reuse.from_options(prefix)
+        self.fallback = Fallback.from_options(prefix)
+        self.stagnation = Stagnation.from_options(prefix)
+        self.regularize = options.getReal("petsc_fs_regularize", 0.0)
+        if not 0 <= self.regularize < 1:
+            raise UsageError(f"-{prefix}petsc_fs_regularize {self.regularize:g}: expected a number from 0 to below 1")
+        self._failure: PetscFsError | None = None  # of the set-up of the present preconditioner
+        self._is_set_up = False
+        self._solved = False  # whether the last solve converged
         self.system, self.ksp = self._build()
+        self._set_operators()
         self.restarts = options.getInt("petsc_fs_restarts", 2)
         self.rtol = float(self.ksp.getTolerances()[0])
         self.true_rtol = options.getReal("petsc_fs_true_rtol", self.rtol)
@@ -225,14 +190,46 @@ class Solver:
             else:
                 ksp.setDMActive(PETSc.KSP.DMActive.ALL, False)
         try:
-            ksp.setFromOptions()
+            with database.replaced(self.fallback.options):
+                ksp.setFromOptions()
         except (PETSc.Error, ImportError) as e:
             ksp.destroy()
             raise UsageError(f"PETSc refuses an option: {brief(e)}") from e
         ksp.setConvergenceHistory(reset=True)
+        self.fallback.adapt(ksp)
         if ksp.getType() == PETSc.KSP.Type.GMRES:
             ksp.setComputeSingularValues(True)  # of what it projects anyway; for the error estimate
+        self.stagnation.watch(ksp)
         return ksp
+
+    def _renew_preconditioner(self) -> None:
+        """Have the KSP, with its tolerances and monitors, make its preconditioner anew by the options. Collective."""
+        pc = PETSc.PC().create(self.layout.comm)
+        pc.setOptionsPrefix(self.prefix)
+        if len(self.system.members) > 1:
+            pc.setDM(self.system.dm)
+        self.ksp.setPC(pc)
+        try:
+            with database.replaced(self.fallback.options):
+                pc.setFromOptions()
+        except (PETSc.Error, ImportError) as e:
+            raise translate(e, "set-up failed") from None
+        if self.ksp.getType() == PETSc.KSP.Type.GMRES:
+            self.ksp.setComputeSingularValues(True)
+
+    def _set_operators(self) -> None:
+        """Give the KSP the Jacobian, and the matrix its preconditioner is made of where that is another. Collective."""
+        system, before = self.system, self._preconditioned
+        self._divisors, self._lifted, self._failure = system.blocks, list[str](), None
+        self._preconditioned = None
+        if system.J.getType() == "nest" and self.fallback.monolithic:
+            self._preconditioned = one_matrix(self.layout.fields, system.blocks, self.layout)
+        elif system.J.getType() == "nest" and (least := max(self.regularize, self.fallback.lifted)):
+            self._preconditioned, self._divisors, self._lifted = lift(system.problem, system.members, self.scene, least)
+        if before is not None:
+            self._renew_preconditioner()  # or parts of the old one would take the old matrix for theirs
+            before.destroy()
+        self.ksp.setOperators(system.J, self._preconditioned or system.J)
 
     def update(self, scene: Scene) -> None:
         """Take the values of another scene of the same fields and sizes.
@@ -243,6 +240,7 @@ class Solver:
         scales = self.system.row_scale
         with together(self.layout.comm):
             self.scene = self._part(scene)
+        renew = self.fallback.take_matrix(self.ksp, self._solved)
         try:
             self.system.update(self.scene, grow=True)
         except PatternChanged:
@@ -250,27 +248,46 @@ class Solver:
             self.system.destroy()
             self.system, self.ksp = self._build()
             self.rebuilds += 1
+        else:
+            if renew:
+                self._renew_preconditioner()
+                self.reuse.release()
         if any(scale != 1.0 for scale in scales.values()):
             self.system.scale_rows(scales)
         self.reuse.take_matrix(self.scene.contact_state, self.layout.comm, self._mechanics_scale())
         self.scene.blocks.clear()
-        self.ksp.setOperators(self.system.J, self.system.J)  # or KSPSetUp leaves the set-up to the first product
+        self._set_operators()  # or KSPSetUp leaves the set-up to the first product
         collect_garbage(self.layout.comm)
         self._built_seconds = time.perf_counter() - started
 
     def set_up(self) -> None:
         """Set the preconditioner up, where it is not. Collective.
 
+        Where it fails and there is a fallback, nothing is raised: that is up to `solve`.
+
         Raises:
             SolveError: PETSc could not.
             PetscFsError: an operator or option of a level is impossible.
         """
-        started = time.perf_counter()
         try:
-            self.ksp.setUp()
-            set_up_leaves(self.ksp.getPC())
+            self._set_up()
+        except (SolveError, SceneError) as e:
+            if not self.fallback.remaining():
+                raise
+            self._failure = _bare(e)
+
+    def _set_up(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+        started = time.perf_counter()
+        self._is_set_up = False
+        try:
+            with database.replaced(self.fallback.options):
+                self.ksp.setUp()
+                set_up_leaves(self.ksp.getPC())
         except (PETSc.Error, ImportError) as e:
-            raise _ours(e, "set-up failed") from None
+            raise translate(e, "set-up failed") from None
+        self._is_set_up = True
         self._built_seconds += time.perf_counter() - started
         if self.scaling == "always" and not self._looked:
             self._looked = True
@@ -288,34 +305,118 @@ class Solver:
         Raises:
             SolveError: PETSc failed on the way, or the solution is not finite.
         """
-        self.set_up()
-        wanted, atol = max(self.rtol, rtol or 0.0), self.ksp.getTolerances()[1]
-        self.ksp.setTolerances(rtol=wanted)
-        result = self._run_first(wanted)
-        for _ in range(self.restarts):
-            if result.converged or not (result.iterations or result.estimated_error_by_field):
-                break
-            if not result.reason.startswith("CONVERGED"):
-                given_up = result.reason == "DIVERGED_MAX_IT" and result.iterations < ONE_CYCLE
-                if given_up or not self._scale_by_preconditioner(SPREAD["auto"]):
-                    break
-                self.ksp.setInitialGuessNonzero(False)
-            else:
-                known = bool(result.estimated_error_by_field)
-                scaled = self._scale_rows(result.solution, SPREAD["always" if known else "auto"])
-                if known and not scaled:
-                    worst = max(result.estimated_error_by_field.values())
-                    tighter = max(0.1 * wanted * min(1.0, result.error_tolerance / worst), EPS)
-                    self.ksp.setTolerances(rtol=tighter, atol=0.0)
-                self.ksp.setInitialGuessNonzero(known or not scaled)
-            better = self._run(result.iterations, result.solve_seconds, wanted)
-            if better.estimated_error_by_field or not result.estimated_error_by_field:
-                result = better
-        self.ksp.setInitialGuessNonzero(False)
-        self.ksp.setTolerances(rtol=wanted, atol=atol)
-        self.reuse.note_solve(result.iterations, result.true_relative_residual)
+        wanted = max(self.rtol, rtol or 0.0)
+        given, self._solved = not self.fallback.taken, False
+        result = self._attempt(wanted, raising=not self.fallback.remaining())
+        if isinstance(result, Result) and given:
+            self.reuse.note_solve(result.iterations, result.true_relative_residual)
+        if not isinstance(result, Result) or (not result.converged and self.fallback.remaining()):
+            result = self._fall_back(wanted, result)
+        self._solved = result.converged
+        result = replace(result, setup_seconds=self._built_seconds, notes=(*self._lifted, *result.notes))
         self._built_seconds = 0.0
         return result
+
+    def _attempt(self, wanted: float, *, raising: bool) -> Result | SolveError | SceneError:
+        """One solve by the options in force; its error, where that is not to be raised. Collective."""
+        try:
+            return replace(self._solve(wanted), fallback=self.fallback.name)
+        except (SolveError, SceneError) as e:
+            if raising:
+                raise
+            return _bare(e)
+
+    def _fall_back(self, wanted: float, outcome: Result | SolveError | SceneError) -> Result:
+        """Go up the ladder until a solve converges; else the one with the least residual. Collective.
+
+        Raises:
+            SolveError: all of them ended with an error; or SceneError, as the first one did.
+        """
+        first, best = outcome, outcome if isinstance(outcome, Result) else None
+        lines = [f"fallback from {self.fallback.name or 'the options as given'}: {_describe(outcome)}"]
+        iterations, seconds = (best.iterations, best.solve_seconds) if best is not None else (0, 0.0)
+        weak = explain_weakness(self.system.problem, self.scene)
+        self.fallback.see(self.ksp.getPC() if self._is_set_up else None, self.layout.fields, bool(weak))
+        for rung in self.fallback.remaining():
+            before = self.fallback.options, self.fallback.lifted
+            try:
+                where = self.fallback.climb(rung, self.ksp)
+            except NotApplicableError as e:
+                lines.append(f"fallback {rung}: {e}, skipped")
+                continue
+            if (self.fallback.options, self.fallback.lifted) != before:
+                self._renew_preconditioner()
+                self.reuse.release()
+                self._set_operators()
+            outcome = self._attempt(wanted, raising=False)
+            lines.append(f"fallback {rung}{where}: {_describe(outcome)}")
+            if isinstance(outcome, Result):
+                iterations, seconds = iterations + outcome.iterations, seconds + outcome.solve_seconds
+                better = best is None or outcome.true_relative_residual < best.true_relative_residual
+                best = outcome if outcome.converged or better else best
+                if outcome.converged:
+                    break
+        if best is None:
+            assert not isinstance(first, Result)
+            raise type(first)("; ".join([str(first), *lines[1:]]))
+        return replace(best, iterations=iterations, solve_seconds=seconds, notes=(*lines, *best.notes))
+
+    def _solve(self, wanted: float) -> Result:
+        """Solve by the options in force, with restarts and scaling. Collective.
+
+        Raises:
+            SolveError: PETSc failed on the way, or the solution is not finite.
+        """
+        self._set_up()
+        atol = self.ksp.getTolerances()[1]
+        self.ksp.setTolerances(rtol=wanted)
+        try:
+            result = self._run_first(wanted)
+            for _ in range(self.restarts):
+                if result.converged and not self._is_doubtful(result, wanted):
+                    break
+                if not (result.iterations or result.estimated_error_by_field):
+                    break
+                if not self._prepare_restart(result, wanted):
+                    break
+                better = self._run(result.iterations, result.solve_seconds, wanted)
+                if result.converged and not better.converged:
+                    result = replace(result, iterations=better.iterations, solve_seconds=better.solve_seconds)
+                    break
+                if better.estimated_error_by_field or not result.estimated_error_by_field:
+                    result = better
+        finally:
+            self.ksp.setInitialGuessNonzero(False)
+            self.ksp.setTolerances(rtol=wanted, atol=atol)
+        return result
+
+    def _is_doubtful(self, result: Result, wanted: float) -> bool:
+        """Whether a field hides in the norm of the residual, so that a restart is worth its iterations."""
+        worst = max(result.estimated_error_by_field.values(), default=0.0)
+        return math.isfinite(result.error_tolerance) and worst > DOUBTFUL * wanted
+
+    def _prepare_restart(self, result: Result, wanted: float) -> bool:
+        """Scale rows, tighten the tolerance or start from what is there; whether another run may help. Collective."""
+        if not result.reason.startswith("CONVERGED"):
+            given_up = result.reason == "DIVERGED_MAX_IT" and result.iterations < ONE_CYCLE
+            if given_up or not self._scale_by_preconditioner(SPREAD["auto"]):
+                return False
+            self.ksp.setInitialGuessNonzero(False)
+            return True
+        known = bool(result.estimated_error_by_field)
+        scaled = self._scale_rows(result.solution, SPREAD["always" if known else "auto"])
+        if known and not scaled:
+            worst = max(result.estimated_error_by_field.values())
+            aim = min(result.error_tolerance, DOUBTFUL * wanted)
+            tighter = max(0.1 * wanted * min(1.0, aim / worst), EPS)
+            self.ksp.setTolerances(rtol=tighter, atol=0.0)
+        elif not scaled and any(scale != 1.0 for scale in self.system.row_scale.values()):
+            # small in the norm of the scaled rows alone
+            missing = 0.1 * result.tolerance / result.true_relative_residual
+            atol = self.ksp.getTolerances()[1]
+            self.ksp.setTolerances(rtol=max(wanted * missing, EPS), atol=atol * missing)
+        self.ksp.setInitialGuessNonzero(known or not scaled)
+        return True
 
     def _run_first(self, wanted: float) -> Result:
         """Solve from zero; where what was kept for an older matrix is not good enough, build the latest and go on."""
@@ -336,8 +437,8 @@ class Solver:
             self.ksp.setTolerances(max_it=max_it)
         self.reuse.give_up()
         self.system.J.stateIncrease()  # or PETSc takes the preconditioner for the latest
-        self.ksp.setOperators(self.system.J, self.system.J)
-        self.set_up()
+        self._set_operators()
+        self._set_up()
         self.ksp.setInitialGuessNonzero(better)
         result = self._run(iterations, seconds, wanted)
         self.ksp.setInitialGuessNonzero(False)
@@ -345,7 +446,7 @@ class Solver:
 
     def _scale_by_preconditioner(self, spread: float) -> bool:
         """Scale rows by the solution that the preconditioner alone gives; see `_scale_rows`. Collective."""
-        self._apply_preconditioner(self.system.b, self.x)
+        apply_preconditioner(self.ksp, self.system.b, self.x)
         solution = self.system.by_field(self.x)
         self.x.set(0.0)
         finite = all(bool(np.isfinite(v).all()) for v in solution.values())
@@ -375,129 +476,28 @@ class Solver:
         if not (math.isfinite(common) and common > 0):
             return False
         self.system.scale_rows({f: 2.0 ** round(math.log2(common / n)) if n > 0 else 1.0 for f, n in sizes.items()})
-        self.ksp.setOperators(self.system.J, self.system.J)
+        self._set_operators()
         self.reuse.take_scaled(self._mechanics_scale())
-        self.set_up()
+        self._set_up()
         return True
 
     def _mechanics_scale(self) -> float:
         """What the rows of mechanics have been multiplied by."""
         return next((self.system.row_scale[f] for f in self.layout.fields if f in MECHANICS), 1.0)
 
-    def _apply_preconditioner(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        try:
-            self.ksp.getPC().apply(x, y)
-        except (PETSc.Error, ImportError) as e:
-            raise _ours(e, "the preconditioner failed") from None
-
     def _run(self, iterations: int, seconds: float, wanted: float) -> Result:
         """Solve once, from the current solution if the KSP is told so; iterations and seconds are added up."""
+        self.stagnation.restart(self.ksp)
         started = time.perf_counter()
         try:
             self.ksp.solve(self.system.b, self.x)
         except (PETSc.Error, ImportError) as e:
-            raise _ours(e, "solve failed") from None
+            raise translate(e, "solve failed") from None
         seconds += time.perf_counter() - started
-        return self._judge(iterations + self.ksp.getIterationNumber(), seconds, wanted)
-
-    def _judge(self, iterations: int, solve_seconds: float, rtol: float) -> Result:
-        system, reason = self.system, reason_name(self.ksp)
-        residual = system.b.duplicate()
-        system.J.mult(self.x, residual)
-        residual.aypx(-1.0, system.b)
-        norms = system.field_norms(system.by_field(residual))
-        size = system.b.norm() or 1.0
-        relative = residual.norm() / size
-        if not np.isfinite(relative):
-            residual.destroy()
-            where = broken_level(self.ksp.getPC(), system.b)
-            hint = ", for MUMPS raise -mat_mumps_icntl_14 there" if where else ""
-            raise SolveError(
-                f"the solution is not finite after {iterations} iterations ({reason})"
-                + (f"; {where}: see -ksp_view{hint}" if where else "")
-            )
-        atol = self.ksp.getTolerances()[1]
-        loosened = rtol / self.rtol if self.rtol else 1.0
-        tolerance = max(self.true_rtol * loosened, atol / size)
-        solution = system.by_field(self.x)
-        limited = False
-        if relative > tolerance:
-            floor = ROUNDING_UNITS * system.rounding_level(solution) / size
-            limited = bool(relative <= floor)
-            tolerance = floor if limited else tolerance
-        estimates: dict[str, float] = {}
-        error_tolerance = math.inf
-        if self.error_factor:
-            error_tolerance = max(self.error_factor * rtol, ENOUGH)
-        if error_tolerance >= 1.0:
-            error_tolerance = math.inf  # so loose a tolerance promises nothing of the fields
-        if relative <= tolerance and error_tolerance < math.inf:
-            correction = residual.duplicate()
-            self._apply_preconditioner(residual, correction)
-            doubt = self._doubt()
-            estimates = {f: doubt * e for f, e in self._ratios(system.by_field(correction), solution).items()}
-            correction.destroy()
-        residual.destroy()
-        notes = self._notes_on_scaling()
-        if relative > tolerance or max(estimates.values(), default=0.0) > error_tolerance:
-            notes += [str(weak) for weak in weakest_entries(system)]
-        wrong = {f: e for f, e in estimates.items() if not e <= error_tolerance}
-        if wrong:
-            found = ", ".join(f"{f} {e:.1e}" for f, e in wrong.items())
-            notes.append(
-                f"the residual is small, but not the estimated error: {found}; "
-                f"at most {error_tolerance:.1e} is asked for"
-            )
-        return Result(
-            iterations=iterations,
-            converged=bool(relative <= tolerance) and not wrong,
-            reason=reason,
-            true_relative_residual=relative,
-            rtol=rtol,
-            tolerance=tolerance,
-            limited_by_rounding=limited,
-            residual_by_field={f: n / size for f, n in norms.items()},
-            error_by_field=self._errors(solution),
-            setup_seconds=self._built_seconds,
-            solve_seconds=solve_seconds,
-            solution=solution,
-            estimated_error_by_field=estimates,
-            error_tolerance=error_tolerance,
-            notes=tuple(notes),
-        )
-
-    def _doubt(self) -> float:
-        """By how much one application of the preconditioner may fall short of the error; at least 1. Collective.
-
-        The inverse of the least singular value of J M^-1 that GMRES has seen, and of the weakest entry of J_44, which
-        M divides by where it is no factorisation.
-        """
-        least = 1.0
-        if self.ksp.getType() == PETSc.KSP.Type.GMRES and self.ksp.getIterationNumber():
-            least = float(self.ksp.computeExtremeSingularValues()[1])
-            least = least if least < USUAL else 1.0
-        if self.ksp.getPC().getType() not in (PETSc.PC.Type.LU, PETSc.PC.Type.CHOLESKY):
-            least = min(least, *(weak.ratio for weak in weakest_entries(self.system)), 1.0)
-        return 1.0 / max(min(least, 1.0), EPS)
-
-    def _notes_on_scaling(self) -> list[str]:
-        scales = self.system.row_scale
-        if all(scale == 1.0 for scale in scales.values()):
-            return []
-        return ["rows scaled by " + ", ".join(f"{f} {scales[f]:.1e}" for f in self.layout.fields)]
-
-    def _ratios(self, part: FieldArrays, whole: FieldArrays) -> dict[str, float]:
-        """|part| / |whole| per field; infinite where only the latter is zero. Collective."""
-        a, b = self.system.field_norms(part), self.system.field_norms(whole)
-        return {f: a[f] / b[f] if b[f] else math.inf if a[f] else 0.0 for f in self.layout.fields}
-
-    def _errors(self, solution: FieldArrays) -> dict[str, float]:
-        reference = self.scene.reference
-        if set(reference) != set(self.layout.fields):
-            return {}
-        error = self.system.field_norms({f: solution[f] - reference[f] for f in reference})
-        size = self.system.field_norms(reference)
-        return {f: error[f] / (size[f] or 1.0) for f in self.layout.fields}
+        loosened = wanted / self.rtol if self.rtol else 1.0
+        criteria = Criteria(wanted, self.true_rtol * loosened, self.error_factor)
+        result = judge(self.system, self.ksp, self.x, criteria, self.scene, self._divisors, str(self.stagnation))
+        return replace(result, iterations=iterations + result.iterations, solve_seconds=seconds)
 
     def history(self) -> NDArray[np.float64]:
         """Residual norms of the last solve, as the Krylov method saw them; the first is the initial one."""
@@ -507,6 +507,8 @@ class Solver:
         """Free PETSc's objects. Collective; may be called twice."""
         if self.ksp is not None:
             self.ksp.destroy()
+            if self._preconditioned is not None:
+                self._preconditioned.destroy()
             self.system.destroy()
             self.ksp = None
             self.reuse.release()
@@ -520,16 +522,9 @@ def collect_garbage(comm: MPI.Intracomm) -> None:
 
 def set_up_leaves(pc: PETSc.PC) -> None:
     """Set up what PCFIELDSPLIT leaves to the first application, so that set-up time holds all of it. Collective."""
-    if pc.getType() == PETSc.PC.Type.FIELDSPLIT:
-        for ksp in pc.getFieldSplitSubKSP():
-            ksp.setUp()
-            set_up_leaves(ksp.getPC())
-    elif pc.getType() == PETSc.PC.Type.PYTHON:
-        inner = getattr(pc.getPythonContext(), "inner", None)
-        if inner is not None:
-            set_up_leaves(inner)
-    else:
-        pc.setUpOnBlocks()
+    for level in levels(pc):
+        level.setUp()
+        level.setUpOnBlocks()
 
 
 def needed_data(prefix: str) -> dict[str, bool]:
@@ -545,34 +540,17 @@ def needed_data(prefix: str) -> dict[str, bool]:
     }
 
 
-def _ours(error: Exception, what: str) -> PetscFsError:
-    """The error of this package that stands for one of PETSc's.
-
-    An exception in a Python PC comes through PETSc as it is, or, in newer petsc4py, as the cause of its error.
-    """
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, PetscFsError):
-            return cause
-        if isinstance(cause, ImportError) or (isinstance(cause, PETSc.Error) and cause.ierr in REFUSALS):
-            return UsageError(f"PETSc refuses an option: {brief(cause)}")
-        if isinstance(cause, Exception) and not isinstance(cause, PETSc.Error):
-            return SolveError(f"{what}: {type(cause).__name__}: {cause}")
-        cause = cause.__cause__ or cause.__context__
-    return SolveError(f"{what}: {brief(error)}")
+def _bare(error: AnError) -> AnError:
+    """An error that is kept, without the frames it came through: on some ranks only they would keep PETSc's objects."""
+    error.__cause__ = error.__context__ = None
+    return error.with_traceback(None)
 
 
-def reason_name(ksp: PETSc.KSP) -> str:
-    """Name of the reason why a KSP stopped, for example CONVERGED_RTOL."""
-    number = ksp.getConvergedReason()
-    names = {v: k for k, v in vars(PETSc.KSP.ConvergedReason).items() if isinstance(v, int)}
-    return str(names.get(number, number))
-
-
-def brief(error: Exception) -> str:
-    """One line of an error; of one of PETSc's, its code's text and the innermost message."""
-    if not isinstance(error, PETSc.Error):
-        return str(error)
-    lines = [re.sub(r"^\[\d+\]\s*", "", line).strip() for line in str(error).splitlines()]
-    messages = [line for line in lines if line and not re.match(r"\w+\(\) (line|at)", line)]
-    return "; ".join(messages) or f"error code {error.ierr}"
+def _describe(outcome: Result | PetscFsError) -> str:
+    """How a solve ended, in a few words."""
+    if not isinstance(outcome, Result):
+        return str(outcome)
+    worst = max(outcome.estimated_error_by_field.values(), default=None)
+    return f"{outcome.iterations} iterations, {outcome.reason}, true residual {outcome.true_relative_residual:.1e}" + (
+        f", estimated error {worst:.1e}" if worst is not None else ""
+    )

@@ -9,7 +9,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import petsc_fs
-from petsc_fs import hdf5, options
+from petsc_fs import hdf5, options, stress_cases
+from petsc_fs.errors import SolveError, UsageError
 from petsc_fs.layout import Layout
 from petsc_fs.scene import CSR, Scene
 from petsc_fs.solver import Solver
@@ -154,11 +155,10 @@ def unequal(scene: Scene) -> Layout:
     return Layout.from_cells(comm, scene.dimension, cells)
 
 
-@pytest.mark.parametrize("file", [f.path.name for f in options.shipped()])
+@pytest.mark.parametrize("file", options.shipped(), ids=lambda file: file.path.name)
 def test_ranks_without_a_fracture_cell(database, file):
-    database(file)
-    name = {"poromechanics.opts": "biot", "flow.opts": "flow", "contact_mechanics.opts": "contact"}.get(file, "model1")
-    scene = load(name)
+    database(file.path.name)
+    scene = next(scene for name in ("model1", "biot", "flow", "contact") if file.fits((scene := load(name)).fields))
     result = Solver(scene, layout=unequal(scene)).solve()
     assert result.converged, result
 
@@ -205,3 +205,91 @@ def test_a_block_of_zeros_in_the_residual_norm_is_not_excused_by_rounding(databa
     assert result.reason.startswith("CONVERGED")
     assert not result.converged
     assert not result.limited_by_rounding
+
+
+class Spoiled:
+    """Copies, until the fourth application gives no numbers."""
+
+    applications = 0
+
+    def apply(self, pc, x, y):
+        Spoiled.applications += 1
+        x.copy(y)
+        if Spoiled.applications > 3:
+            y.set(np.nan)
+
+
+def test_numbers_that_are_not_finite_stop_a_solve_at_once_and_the_level_is_named(database):
+    Spoiled.applications = 0
+    database(
+        "contact_poromechanics.opts",
+        **{f"{MECHANICS}pc_type": "python", f"{MECHANICS}pc_python_type": f"{__name__}.Spoiled"},
+    )
+    with pytest.raises(SolveError, match=rf"after 3 iterations.*level -{MECHANICS} \(python\)"):
+        Solver(load("model2")).solve()
+
+
+@pytest.mark.parametrize("file", ["contact_poromechanics.opts", "contact_poromechanics_fast.opts"])
+@pytest.mark.parametrize(("field", "level"), [("momentum", MECHANICS), ("mass", "fieldsplit_mass_")])
+def test_an_entry_that_overflows_is_traced_to_its_level(database, file, field, level):
+    database(file)
+    scene = load("model2")
+    block = scene.blocks[field, field]
+    data = block.data.copy()
+    data[data.size // 2] = 1e300
+    result = Solver(replace(scene, blocks={**scene.blocks, (field, field): block._replace(data=data)})).solve()
+    assert not result.converged
+    assert result.reason == "DIVERGED_NANORINF"
+    assert result.iterations == 0
+    assert any(level in note and "not finite" in note for note in result.notes)
+
+
+def test_a_right_hand_side_that_overflows_is_named(database):
+    database("contact_poromechanics.opts")
+    scene = load("model2")
+    with pytest.raises(SolveError, match="right-hand side overflows in mass:"):
+        Solver(replace(scene, rhs={**scene.rhs, "mass": np.full_like(scene.rhs["mass"], 1e200)})).solve()
+
+
+def test_a_diverging_iteration_is_stopped(database):
+    database("fixed_stress_richardson.opts")
+    result = Solver(load("model2")).solve()
+    assert result.reason == "DIVERGED_DTOL"
+    assert not result.converged
+    assert result.iterations < 100
+
+
+def test_an_iteration_that_stands_still_is_stopped_and_says_so(database):
+    """Richardson's iteration with next to no preconditioner, and PETSc's own test again for the next solve."""
+    database(None, ksp_type="richardson", ksp_richardson_scale="1e-30", ksp_norm_type="unpreconditioned")
+    database("direct.opts", ksp_max_it="1000", petsc_fs_stagnation_window="7", petsc_fs_stagnation_ratio="0.5")
+    solver = Solver(load("model2"))
+    result = solver.solve()
+    assert result.reason == "STAGNATED"
+    assert result.iterations == 7
+    assert "stagnated: the residual fell by less than 0.5 of itself over the last 7 iterations" in result.notes
+    solver.ksp.setTolerances(max_it=5)
+    assert solver.solve().reason == "DIVERGED_MAX_IT"
+
+
+def test_gmres_that_stands_still_is_stopped(database):
+    """Without a preconditioner the units of the fields alone keep it from getting anywhere."""
+    database(None, ksp_type="gmres", ksp_gmres_restart="5", ksp_pc_side="right", pc_type="none", ksp_rtol="1e-10")
+    database(None, petsc_fs_stagnation_window="30", petsc_fs_stagnation_ratio="0.5", petsc_fs_restarts="0")
+    result = Solver(load("model2")).solve()
+    assert result.reason == "STAGNATED"
+    assert 30 <= result.iterations < 1000
+
+
+@pytest.mark.parametrize("value", [{"petsc_fs_stagnation_window": "-1"}, {"petsc_fs_stagnation_ratio": "1.5"}])
+def test_impossible_stagnation_is_refused(database, value):
+    database("contact_poromechanics.opts", **value)
+    with pytest.raises(UsageError, match="petsc_fs_stagnation_window must not be negative"):
+        Solver(load("model2"))
+
+
+def test_a_hidden_field_is_found_out_without_singular_values(database):
+    """Mass balance 1e-8 of the rest: Richardson's iteration stops at rounding, far from the solution."""
+    database("fixed_stress_richardson.opts", ksp_max_it="60")
+    scene = stress_cases.scaled(stress_cases.load("base"), rows={"mass": 1e-8})
+    assert not Solver(scene).solve().converged

@@ -12,7 +12,7 @@ import petsc_fs
 from petsc_fs import hdf5
 from petsc_fs.layout import Layout
 from petsc_fs.scene import CSR, Scene
-from petsc_fs.system import System
+from petsc_fs.system import PatternChanged, System
 
 pytestmark = pytest.mark.mpi
 comm = MPI.COMM_WORLD
@@ -90,7 +90,19 @@ def test_a_block_with_a_new_entry_is_made_anew_and_no_other():
     assert system.J.getNestSubMatrix(k, k).handle == system.blocks[CHANGING].handle
 
 
+def test_as_many_entries_in_other_places_are_another_pattern():
+    scene, layout = part()
+    system = System(scene, layout)
+    b = scene.blocks[CHANGING]
+    columns = b.indices.copy()
+    columns[b.indptr[1] - 1] = scene.sizes["contact"] - 1 if comm.rank == 0 else columns[b.indptr[1] - 1]
+    assert comm.rank > 0 or (np.diff(columns[: b.indptr[1]]) > 0).all()
+    with pytest.raises(PatternChanged, match="an entry is new"):
+        system.update(replace(scene, blocks=scene.blocks | {CHANGING: CSR(b.indptr, columns, b.data)}))
+
+
 GROWS_ON_ONE_RANK = """
+import sys
 import petsc4py; petsc4py.init([])
 from pathlib import Path
 import numpy as np
@@ -111,7 +123,8 @@ if comm.rank == 1:
     less.blocks["contact", "contact"] = CSR(np.minimum(b.indptr, b.indptr[-1] - 1), b.indices[:-1], b.data[:-1])
 solver = Solver(less, layout=layout)
 solver.update(full)
-print("rebuilds", solver.rebuilds, "converged", solver.solve().converged, flush=True)
+converged = solver.solve().converged
+sys.stdout.write(f"rebuilds {solver.rebuilds} converged {converged}\\n")  # print() writes a word at a time
 solver.destroy()
 del solver
 """

@@ -1,0 +1,45 @@
+"""What PETSc says when it fails or stops, in the terms of this package."""
+
+from __future__ import annotations
+
+import re
+
+from petsc4py import PETSc
+
+from petsc_fs.errors import PetscFsError, SolveError, UsageError
+
+REFUSALS = (62, 63, 86)
+"""PETSc's codes for a wrong argument, one out of range and an unknown type: what bad options give."""
+
+
+def translate(error: Exception, what: str) -> PetscFsError:
+    """The error of this package that stands for one of PETSc's.
+
+    An exception in a Python PC comes through PETSc as it is, or, in newer petsc4py, as the cause of its error.
+    """
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, PetscFsError):
+            return cause
+        if isinstance(cause, ImportError) or (isinstance(cause, PETSc.Error) and cause.ierr in REFUSALS):
+            return UsageError(f"PETSc refuses an option: {brief(cause)}")
+        if isinstance(cause, Exception) and not isinstance(cause, PETSc.Error):
+            return SolveError(f"{what}: {type(cause).__name__}: {cause}")
+        cause = cause.__cause__ or cause.__context__
+    return SolveError(f"{what}: {brief(error)}")
+
+
+def brief(error: Exception) -> str:
+    """One line of an error; of one of PETSc's, its code's text and the innermost message."""
+    if not isinstance(error, PETSc.Error):
+        return str(error)
+    lines = [re.sub(r"^\[\d+\]\s*", "", line).strip() for line in str(error).splitlines()]
+    messages = [line for line in lines if line and not re.match(r"\w+\(\) (line|at)", line)]
+    return "; ".join(messages) or f"error code {error.ierr}"
+
+
+def reason_name(ksp: PETSc.KSP) -> str:
+    """Name of the reason why a KSP stopped, for example CONVERGED_RTOL."""
+    number = ksp.getConvergedReason()
+    names = {v: k for k, v in vars(PETSc.KSP.ConvergedReason).items() if isinstance(v, int)}
+    return str(names.get(number, number))
