@@ -100,7 +100,10 @@ class Ruler:
 
 
 def _norm(weight: Floats, values: Floats) -> float:
-    return float(np.sqrt(np.sum(weight * values**2)))
+    largest = _greatest(values)  # by which nothing over- or underflows when it is squared
+    if not (largest > 0 and np.isfinite(largest)):
+        return largest
+    return largest * float(np.sqrt(np.sum(weight * (values / largest) ** 2)))
 
 
 def multiply(block: CSR, x: Floats) -> Floats:

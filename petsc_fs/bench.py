@@ -39,7 +39,6 @@ from petsc_fs.compare import describe_machine
 from petsc_fs.errors import SolveError, UsageError
 from petsc_fs.fields import MECHANICS
 from petsc_fs.measure import environment, launcher
-from petsc_fs.tree import CANONICAL
 
 Record = dict[str, Any]
 CLOCKS = ("wall", "cpu")
@@ -301,22 +300,18 @@ def _median(values: Sequence[float]) -> float:
 def operator_complexities(hierarchies: Sequence[Record], sizes: Mapping[str, int]) -> dict[str, float]:
     """Entries of all levels over those of the finest, of the multigrids of mechanics and of mass.
 
-    Several hierarchies of one block, as where its components have one each, count together.
+    Several hierarchies of one block, as where its components have one each, count together. The last one with as many
+    rows as there are pressures is that of mass: without fractures components of displacement have as many.
     """
     finest: dict[str, int] = {}
     entries: dict[str, int] = {}
-    for hierarchy in hierarchies:
-        if not hierarchy["levels"]:
-            continue
-        block = _block_of(hierarchy, sizes)
+    known = [hierarchy for hierarchy in hierarchies if hierarchy["levels"]]
+    mass = max((k for k, h in enumerate(known) if h["levels"][0][0] == sizes.get("mass")), default=None)
+    for k, hierarchy in enumerate(known):
+        block = "mass" if k == mass else "mechanics"
         finest[block] = finest.get(block, 0) + hierarchy["levels"][0][1]
         entries[block] = entries.get(block, 0) + sum(n for _, n in hierarchy["levels"])
     return {block: entries[block] / finest[block] for block in finest}
-
-
-def _block_of(hierarchy: Record, sizes: Mapping[str, int]) -> str:
-    rows = hierarchy["levels"][0][0]
-    return "mass" if rows == sizes.get("mass") else "mechanics"
 
 
 def traffic(about: Record, hierarchies: Sequence[Record], iterations: int, restart: int) -> float:
@@ -361,56 +356,5 @@ def describe(row: Row) -> str:
     return f"{where}: {row.iterations} iterations, {row.setup:.3g} + {row.solve:.3g} s, ratio {row.ratio:.2f}"
 
 
-def geometric_means(rows: Sequence[Row]) -> dict[tuple[str, int], float]:
-    """Per file and number of ranks the geometric mean of its ratios."""
-    found: dict[tuple[str, int], list[float]] = {}
-    for row in rows:
-        if np.isfinite(row.ratio):
-            found.setdefault((row.file, row.ranks), []).append(row.ratio)
-    return {key: float(np.exp(np.mean(np.log(ratios)))) for key, ratios in found.items()}
-
-
-def page(found: Benchmark) -> str:
-    """The measurements as a Markdown section."""
-    from petsc_fs.memory import in_units
-
-    clock = {"wall": "by the clock", "cpu": "of the processor, the busiest rank's"}[found.settings.clock]
-    base = found.rows[0].file
-    lines = [
-        f"Seconds {clock}; medians of {found.settings.repeat} turns. Ratios are to `{base}` in the same turn;",
-        "in brackets the least and the greatest. Memory is what the process grew by, over all ranks. Complexity:",
-        "entries of all levels over those of the finest, of mechanics and of mass. Traffic: bytes per iteration,",
-        "estimated; and what that makes of the bandwidth of STREAM's triad on as many ranks.",
-        "",
-        "| input | unknowns | ranks | file | iterations | set-up s | solve s | set-up ratio | solve ratio | ratio |"
-        " memory | complexity | traffic | of STREAM | Python |",
-        f"|{'---|' * 15}",
-    ]
-    for row in found.rows:
-        name = row.input + (f" ({row.solves} steps)" if row.solves > 1 else "")
-        cells = [name, f"{row.unknowns:,}", str(row.ranks), f"`{row.file}`"]
-        if row.outcome:
-            lines.append(f"| {' | '.join([*cells, row.outcome])} |{' |' * 10}")
-            continue
-        missed = "" if row.converged else " (misses its tolerance)"
-        cells += [f"{row.iterations}{missed}", f"{row.setup:.3g}", f"{row.solve:.3g}"]
-        cells += [f"{row.setup_ratio:.2f}", f"{row.solve_ratio:.2f}"]
-        cells += [f"**{row.ratio:.2f}** ({row.lowest:.2f}–{row.highest:.2f})", in_units(row.peak)]
-        cells += [f"{row.complexity:.2f}, {row.mass_complexity:.2f}"]
-        known = np.isfinite(row.traffic)
-        cells += [in_units(row.traffic) if known else "", f"{row.bandwidth / row.stream:.0%}" if known else ""]
-        lines.append(f"| {' | '.join([*cells, f'{row.python_share:.1%}'])} |")
-    lines.append("")
-    for (file, ranks), mean in geometric_means(found.rows).items():
-        if file != base:
-            worst = max((r for r in found.rows if r.file == file and r.ranks == ranks), key=lambda r: r.ratio)
-            words = f"{ranks} rank{'s' if ranks > 1 else ''}"
-            lines.append(f"- `{file}`, {words}: geometric mean {mean:.2f}, worst {worst.ratio:.2f} on {worst.input}")
-    streams = {row.ranks: row.stream for row in found.rows if np.isfinite(row.stream)}
-    words = ", ".join(f"{in_units(speed)}/s on {n} rank{'s' if n > 1 else ''}" for n, speed in streams.items())
-    lines += ["", f"STREAM's triad: {words}. " + ", ".join(f"{k} {v}" for k, v in found.about.items()) + ".", ""]
-    return "\n".join(lines)
-
-
-DEFAULT_BASE = CANONICAL
+DEFAULT_BASE = "contact_poromechanics.opts"
 """Options file that others are compared to: that of the published configuration."""

@@ -120,6 +120,8 @@ class _Reader:
                     if what in INTEGERS and group[what].dtype.kind not in "iuf":
                         meaning = "0 (sticking), 1 (sliding) or 2 (open)" if what == "contact_state" else "integers"
                         raise SceneError(f"the scene is damaged ({what}: expected {meaning})")
+                    if group[what].dtype.kind not in "biuf":
+                        raise SceneError(f"the scene is damaged ({f}: {what}: expected real numbers)")
                     shape = (expected, 3) if what == "cell_centers" else (expected,)
                     if group[what].shape != shape:
                         raise LayoutError(f"{f}: {what} has shape {group[what].shape}, expected {shape}")

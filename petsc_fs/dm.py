@@ -65,9 +65,11 @@ def field_dm(problem: Problem, members: Members) -> PETSc.DMShell:
     comm = problem.layout.comm
     dm = PETSc.DMShell().create(comm=comm)
     dm.setAppCtx((problem, tuple(members)))
-    local = [sum(problem.layout.sizes(f)[0] for f in fields) for _, fields in members]
-    dm.setGlobalVector(PETSc.Vec().createMPI((sum(local), None), comm=comm))
-    start = comm.scan(sum(local)) - sum(local)
+    layout = problem.layout
+    local = [sum(layout.sizes(f)[0] for f in fields) for _, fields in members]
+    names = [f for _, fields in members for f in fields]
+    dm.setGlobalVector(PETSc.Vec().createMPI((sum(local), sum(layout.sizes(f)[1] for f in names)), comm=comm))
+    start = sum(layout.rows(f)[0] for f in names)  # all rows of the ranks before, which the layout knows
     offsets = start + np.concatenate([[0], np.cumsum(local)])
 
     def index_set(ids: Sequence[int]) -> PETSc.IS:
@@ -115,18 +117,24 @@ def merge_mechanics(names: Sequence[str]) -> Members:
     return merged
 
 
-def field_nest(members: Members, blocks: Blocks, layout: Layout, mat_type: str = "aij") -> PETSc.Mat:
+def field_nest(
+    members: Members, blocks: Blocks, layout: Layout, mat_type: str = "aij", *, assembled: bool = False
+) -> PETSc.Mat:
     """One MatNest over fields, those made of several assembled into one matrix on the diagonal.
 
     Collective. Assembling copies; all other blocks are there by reference, in a MatNest of their own
     where a row or column has several fields. The assembled matrix keeps the block size that its fields
     share, which multigrid needs.
 
+    A product with a MatNest asks all ranks several times where its parts are. `assembled` spares that in the blocks
+    above the diagonal, which upper triangular factors multiply with, for copies of them.
+
     Args:
         members: fields by name, as in `field_dm`.
         blocks: matrices by pairs of fields of the table.
         layout: distribution of rows.
         mat_type: of assembled matrices, see `one_matrix`.
+        assembled: whether blocks of several fields above the diagonal become one matrix, too.
     """
 
     def block(rows: tuple[str, ...], columns: tuple[str, ...]) -> PETSc.Mat | None:
@@ -135,7 +143,9 @@ def field_nest(members: Members, blocks: Blocks, layout: Layout, mat_type: str =
         if not any((r, c) in blocks for r in rows for c in columns):
             return None
         if rows != columns:
-            return _nest(rows, columns, blocks, layout)
+            nest = _nest(rows, columns, blocks, layout)
+            above = layout.fields.index(rows[0]) < layout.fields.index(columns[0])
+            return _as_aij(nest) if assembled and above else nest
         return one_matrix(rows, blocks, layout, mat_type=mat_type)
 
     return PETSc.Mat().createNest([[block(r, c) for _, c in members] for _, r in members], comm=layout.comm)
@@ -158,15 +168,23 @@ def one_matrix(
         return blocks[fields[0], fields[0]]
     nest = _nest(fields, fields, blocks, layout)
     if mat_type == "nest":
+        size = common_block_size(layout, fields)
+        nest.setBlockSizes(size, size)
         return nest
-    matrix = nest.convert("aij", PETSc.Mat() if out is None else out)
-    nest.destroy()
+    matrix = _as_aij(nest, out)
     if mat_type != "aij":
         aij, matrix = matrix, matrix.convert(mat_type, PETSc.Mat())
         aij.destroy()
     if out is None:
         size = common_block_size(layout, fields)
         matrix.setBlockSizes(size, size)
+    return matrix
+
+
+def _as_aij(nest: PETSc.Mat, out: PETSc.Mat | None = None) -> PETSc.Mat:
+    """A MatNest, which ends here, as one AIJ. Collective."""
+    matrix = nest.convert("aij", PETSc.Mat() if out is None else out)
+    nest.destroy()
     return matrix
 
 

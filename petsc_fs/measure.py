@@ -25,13 +25,14 @@ and, where the solve came to an end (kinds converged, stagnated, diverged and un
     residual_by_field  the same, restricted to each field
     base_rss           list, per rank: bytes of resident memory with the scene read, before any PETSc object
     peak_rss           list, per rank: most bytes since then; from the second repetition on, errors count with it
+    fallback           rung of -petsc_fs_fallback that found the solution; "" if none was needed
     direct             whether the outermost preconditioner is a factorisation of the whole matrix
 
 and, where the job names references or asks for errors (else None; see `petsc_fs.accuracy`):
 
     forward_error      against the reference, all fields in one number
     error_by_field     the same per field, each in its natural norm, relative to the reference
-    backward_error     {"normwise": ..., "componentwise": ...}
+    backward_error     {"normwise": ..., "componentwise": ..., "fieldwise": ...}
 
 and, where the job asks for a history, on the records of the last repetition with the least tolerance (else None):
 
@@ -91,6 +92,7 @@ EMPTY: Record = dict.fromkeys(
         "residual_by_field",
         "peak_rss",
         "base_rss",
+        "fallback",
         "direct",
         "forward_error",
         "error_by_field",

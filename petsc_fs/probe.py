@@ -246,6 +246,7 @@ class Probe:
                         "residual_by_field": result.residual_by_field,
                         "base_rss": self.base,
                         "peak_rss": self.comm.allgather(peak()),
+                        "fallback": result.fallback,
                         "direct": solver.ksp.getPC().getType() in ("lu", "cholesky"),
                     }
                 )
@@ -371,13 +372,15 @@ class Judge:
     def errors(self, solution: dict[str, Any], backward: bool = True) -> Record:
         """Forward errors where there is a reference, and backward errors if asked for."""
         from petsc_fs.accuracy import backward_error
+        from petsc_fs.conditioning import fieldwise_backward_error
 
         found: Record = {}
         if self.ruler is not None:
             errors = self.ruler.errors(solution)
             found |= {"forward_error": errors.total, "error_by_field": errors.by_field}
         if backward:
-            found["backward_error"] = backward_error(self.scene, solution)
+            fieldwise = {"fieldwise": fieldwise_backward_error(self.scene, solution)}
+            found["backward_error"] = backward_error(self.scene, solution) | fieldwise
         return found
 
 

@@ -52,6 +52,8 @@ USELESS = 1e-13
 """Relative size of the last correction from which the solution is no reference."""
 PREFIX = "reference_"
 """Of the solvers' options."""
+WORKSPACE = {"mat_mumps_icntl_14": "200"}
+"""Options of MUMPS without which it runs out of the memory that it has foreseen, where it has to pivot much."""
 INNER_RTOL = 1e-8
 """Tolerance of the iterative method for each correction."""
 
@@ -293,7 +295,7 @@ def _direct(scene: Scene, matrix: CSR) -> Iterator[tuple[Solve, str]]:
         return np.asarray(c * x.getArray())
 
     try:
-        with _options({"mat_mumps_icntl_14": "200"} if package == "mumps" else {}):
+        with database(WORKSPACE if package == "mumps" else {}):
             pc.setFromOptions()
             pc.setUp()
         yield correct, f"LU ({package}) of the equilibrated matrix"
@@ -313,7 +315,7 @@ def _iterative(scene: Scene, matrix: CSR) -> Iterator[tuple[Solve, str]]:
     from petsc_fs.solver import Solver
 
     tolerances = {"ksp_rtol": str(INNER_RTOL), "ksp_atol": "0", "petsc_fs_restarts": "0", "ksp_max_it": "500"}
-    with _options({**tree_for(scene, MPI.COMM_SELF).options, **tolerances}):
+    with database({**tree_for(scene, MPI.COMM_SELF).options, **tolerances}):
         solver = Solver(scene, MPI.COMM_SELF, prefix=PREFIX)
 
         def correct(residual: Floats) -> Floats:
@@ -329,7 +331,7 @@ def _iterative(scene: Scene, matrix: CSR) -> Iterator[tuple[Solve, str]]:
 
 
 @contextmanager
-def _options(values: Mapping[str, str | None]) -> Iterator[None]:
+def database(values: Mapping[str, str | None]) -> Iterator[None]:
     """Options under `PREFIX` for the time of a block; the user's own win."""
     from petsc_fs import options
 

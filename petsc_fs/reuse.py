@@ -96,16 +96,21 @@ class Reuse:
         """
         from petsc4py import PETSc
 
+        from petsc_fs.petsc_errors import translate
+
         options = PETSc.Options(prefix)
         level = options.getString("petsc_fs_reuse", LEVELS[0])
         if level not in LEVELS:
             raise UsageError(f"-{prefix}petsc_fs_reuse {level}: expected {' or '.join(LEVELS)}")
         default = Triggers()
-        triggers = Triggers(
-            changed=options.getReal("petsc_fs_reuse_changed", default.changed),
-            growth=options.getReal("petsc_fs_reuse_growth", default.growth),
-            age=options.getInt("petsc_fs_reuse_age", default.age),
-        )
+        try:
+            triggers = Triggers(
+                changed=options.getReal("petsc_fs_reuse_changed", default.changed),
+                growth=options.getReal("petsc_fs_reuse_growth", default.growth),
+                age=options.getInt("petsc_fs_reuse_age", default.age),
+            )
+        except PETSc.Error as e:  # no number
+            raise translate(e, "options") from None
         return cls(level, triggers)
 
     @property

@@ -448,9 +448,9 @@ def renumber(block: CSR, places: Integers, block_size: int, out: CSR) -> None:
         block_size: unknowns per cell of the columns.
         out: of the same rows; may be `block` itself.
     """
+    numbers = (places[:, None] * block_size + np.arange(block_size)).ravel()
     for a, b, start, stop in slabs(block.indptr, SLAB):
-        columns = block.indices[start:stop].astype(np.int64)
-        columns = places[columns // block_size] * block_size + columns % block_size
+        columns = numbers[block.indices[start:stop]]
         rows = np.repeat(np.arange(b - a), np.diff(block.indptr[a : b + 1]))
         order = np.argsort(rows * (places.size * block_size) + columns, kind="stable")
         out.indices[start:stop], out.data[start:stop] = columns[order], block.data[start:stop][order]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from petsc_fs import bench, bench_probe
+from petsc_fs import bench, bench_page, bench_probe
 from petsc_fs.bench import Benchmark, Row, Settings
 from petsc_fs.errors import SolveError, UsageError
 
@@ -123,8 +123,41 @@ def test_a_file_that_fails_has_a_row_that_says_why():
     assert a.outcome == ""
     assert b.outcome == "no such thing"
     assert math.isnan(b.ratio)
-    text = bench.page(Benchmark((a, b), Settings(("a", "b")), {}))
+    text = bench_page.page(Benchmark((a, b), Settings(("a", "b")), {}))
     assert "no such thing" in text
+
+
+def test_tables_of_a_page_are_written_anew_and_its_text_stays(tmp_path):
+    rows = [Row("model1", 2, 100, 1, 1, "a", converged=True, iterations=10, ratio=1.0)]
+    rows += [Row("model1", 2, 100, 1, 1, "b", converged=True, iterations=20, ratio=0.5)]
+    grown = Row("model1_g5", 2, 2500, 1, 1, "b", converged=True, iterations=25, ratio=0.25)
+    for name, found in (("small.json", rows), ("large.json", [rows[0], grown])):
+        (tmp_path / name).write_text(Benchmark(tuple(found), Settings(("a", "b")), {}).to_json())
+    text = "Before\n<!-- bench: small.json large.json -->\nold\n<!-- end -->\nbetween\n"
+    text += "<!-- growth: small.json large.json -->\n"
+    target = tmp_path / "page.md"
+    target.write_text(text + "<!-- end -->\nafter\n")
+    bench_page.fill_page(target)
+    once = target.read_text()
+    assert once.startswith("Before\n<!-- bench: small.json large.json -->\n\n| input |")
+    assert once.endswith("after\n") and "between" in once and "old" not in once
+    assert once.count("| model1_g5 | 2,500 | 1 | `b` | 25 |") == 1
+    assert "- `b`, 1 rank: geometric mean 0.35, worst 0.50 on model1" in once
+    assert "| model1 | 1 | `b` | 100, 2,500 | 20, 25 | 1.25 |" in once
+    bench_page.fill_page(target)
+    assert target.read_text() == once
+    (tmp_path / "large.json").unlink()
+    with pytest.raises(UsageError, match=r"large\.json"):
+        bench_page.fill_page(target)
+    assert target.read_text() == once
+    with pytest.raises(UsageError, match="no table"):
+        bench_page.fill("only text", tmp_path)
+
+
+def test_page_of_the_documentation_has_the_tables_of_its_measurements():
+    docs = SCRIPT.parent.parent / "docs"
+    text = (docs / "fast.md").read_text()
+    assert bench_page.fill(text, docs) == text
 
 
 def test_numbers_survive_json():

@@ -1,5 +1,6 @@
 """Displacements component by component: what the sweep is, and the contract that every PC must meet."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,8 @@ from test_solver import database  # noqa: F401
 import petsc_fs
 from petsc_fs import hdf5
 from petsc_fs.dm import one_matrix
-from petsc_fs.layout import Layout
+from petsc_fs.layout import Layout, rows_of
+from petsc_fs.pc import contact_transform
 from petsc_fs.scene import Scene
 from petsc_fs.solver import Solver
 from petsc_fs.system import System
@@ -113,6 +115,18 @@ def test_it_is_linear_leaves_its_input_and_ignores_old_output(clean):
     pc.destroy()
 
 
+def test_vectors_need_no_block_size(clean):
+    matrix = mechanics("model3", "aij")
+    pc = sweep_of(matrix, component_pc_type="jacobi")
+    x = random_vector(matrix, 6)
+    plain = PETSc.Vec().createMPI(x.getSizes(), comm=matrix.comm)
+    x.copy(plain)
+    assert plain.getBlockSize() == 1 < x.getBlockSize()
+    for _ in range(2):
+        np.testing.assert_array_equal(applied(pc, plain).getArray(), applied(pc, x).getArray())
+    pc.destroy()
+
+
 def test_a_second_set_up_sees_new_values(clean):
     matrix = mechanics("model2", "aij")
     pc = sweep_of(matrix, component_pc_type="jacobi")
@@ -128,6 +142,29 @@ def test_a_second_set_up_sees_new_values(clean):
 def test_a_wrong_order_is_refused(clean):
     with pytest.raises(Exception, match=r"forward or backward or none|error code 101"):
         sweep_of(mechanics("model2", "aij"), component_order="sideways", component_pc_type="jacobi")
+
+
+@pytest.mark.parametrize("file", ["contact_poromechanics", "contact_poromechanics_fast", "contact_poromechanics_left"])
+def test_blocks_by_reference_and_copies_of_them_are_as_good(database, monkeypatch, file):  # noqa: F811
+    """The former for scenes with many rows per rank, the latter where there are few; also after new values."""
+    database(f"{file}.opts")
+    scene = load("model2")
+    doubled = replace(scene, blocks={rc: b._replace(data=2.0 * b.data) for rc, b in scene.blocks.items()})
+    histories = []
+    for rows in (0, contact_transform.FEW_ROWS):
+        monkeypatch.setattr(contact_transform, "FEW_ROWS", rows)
+        solver = Solver(scene)
+        assert solver.solve().converged
+        histories.append(solver.history())
+        solver.update(doubled)
+        result = solver.solve()
+        assert result.converged
+        for f, values in result.solution.items():
+            expected = 0.5 * scene.reference[f][rows_of(solver.layout.own_cells(f), scene.block_size(f))]
+            whole = np.sqrt(comm.allreduce(np.vdot(values - expected, values - expected)))
+            assert whole < 1e-2 * np.linalg.norm(scene.reference[f])
+        solver.destroy()
+    np.testing.assert_allclose(histories[0][:8], histories[1][:8], rtol=1e-6)
 
 
 @pytest.mark.parametrize("scene", ["model1", "model2", "model3"])

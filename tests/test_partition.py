@@ -309,7 +309,7 @@ PAIRS = [
 @pytest.mark.mpi
 @pytest.mark.parametrize(("file", "name"), PAIRS, ids=["-".join(pair).replace(".opts", "") for pair in PAIRS])
 def test_iterations_do_not_depend_on_ranks(database, file, name):
-    """Within 10 %, rounded up to a whole iteration."""
+    """Within 10 %, rounded up to a whole iteration; or within two of them, where there are few."""
     database(file)
     if file == "fixed_stress_richardson.opts":
         from petsc4py import PETSc
@@ -321,4 +321,4 @@ def test_iterations_do_not_depend_on_ranks(database, file, name):
     alone = comm.bcast(Solver(scene, MPI.COMM_SELF).solve().iterations if comm.rank == 0 else 0)
     result = Solver(scene).solve()
     assert result.converged
-    assert result.iterations <= math.ceil(1.1 * alone)
+    assert result.iterations <= max(math.ceil(1.1 * alone), alone + 2)

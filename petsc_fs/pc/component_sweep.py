@@ -122,37 +122,49 @@ class Sweep:
             inner.setUpOnBlocks()
             self.inners += (inner,)
         behind = {"forward": 1, "backward": -1, "none": 0}[order]
-        pairs = [(k, m) for k, m in product(range(D), range(D)) if (k - m) * behind > 0]
-        self._couplings = {(k, m): _component(blocks, D, k, m) for k, m in pairs}
         pairs_of_vectors = [inner.getOperators()[1].createVecs() for inner in self.inners]
         self._y = [right for right, _ in pairs_of_vectors]
         self._x = [left for _, left in pairs_of_vectors]
+        self._couplings: dict[int, list[tuple[PETSc.Mat, PETSc.Vec]]] = {k: [] for k in range(D)}
+        for k, m in product(range(D), range(D)):
+            if (k - m) * behind > 0:
+                coupling = _component(blocks, D, k, m)
+                coupling.scale(-1.0)  # so that a product adds what is subtracted
+                self._couplings[k].append((coupling, self._y[m]))
+        self._whole: tuple[PETSc.Vec, ...] = ()
 
     def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Y = one sweep over the components of x, from zero. Collective."""
         D = len(self.inners)
-        given, result = x.getArray(readonly=True), y.getArray()
+        if not x.getBlockSize() == y.getBlockSize() == D:
+            self._apply_copied(x, y)
+            return
         for k in range(D)[:: -1 if self.order == "backward" else 1]:
             residual, update = self._x[k], self._y[k]
-            residual.setArray(given[k::D])
-            before = [(self._couplings[k, m], self._y[m]) for m in range(D) if (k, m) in self._couplings]
-            if before:
-                residual.scale(-1.0)
-                for coupling, other in before:
-                    coupling.multAdd(other, residual, residual)
-                residual.scale(-1.0)
+            x.strideGather(k, residual)
+            for coupling, other in self._couplings[k]:
+                coupling.multAdd(other, residual, residual)
             self.inners[k].apply(residual, update)
-            result[k::D] = update.getArray(readonly=True)
+            update.strideScatter(k, y)
+
+    def _apply_copied(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """The same for vectors without the block size. Collective."""
+        if not self._whole:
+            size = x.getSizes()
+            self._whole = tuple(PETSc.Vec().createMPI(size, bsize=len(self.inners), comm=x.comm) for _ in range(2))
+        x.copy(self._whole[0])
+        self.apply(*self._whole)
+        self._whole[1].copy(y)
 
     def destroy(self) -> None:
         """Free everything. Collective; may be called twice."""
         for inner in self.inners:
             inner.destroy()
-        for matrix in self._couplings.values():
+        for matrix, _ in (pair for pairs in self._couplings.values() for pair in pairs):
             matrix.destroy()
-        for vector in (*self._x, *self._y):
+        for vector in (*self._x, *self._y, *self._whole):
             vector.destroy()
-        self.inners, self._couplings, self._x, self._y = (), {}, [], []
+        self.inners, self._couplings, self._x, self._y, self._whole = (), {}, [], [], ()
 
 
 def _blocks(operator: PETSc.Mat) -> list[list[Any]]:

@@ -9,9 +9,13 @@ from petsc4py import PETSc
 
 from petsc_fs.dm import Blocks, Members, Problem, field_dm, field_nest, merge_mechanics
 from petsc_fs.errors import LayoutError, SceneError, UsageError, together
-from petsc_fs.fields import in_order
+from petsc_fs.fields import MECHANICS, in_order
 from petsc_fs.pc.wrapper import WrapperPC, choice
 from petsc_fs.scene import CONTACT_STATES, CSR, diagonal_blocks, singular
+
+FEW_ROWS = 5000
+"""Rows of mechanics per rank up to which blocks of several fields are copied: for a `ComponentSweep` that of mechanics,
+and for any solver those above the diagonal."""
 
 
 class ContactTransform(WrapperPC):
@@ -35,7 +39,7 @@ class ContactTransform(WrapperPC):
         -qr_side right|left|none: the transformation.
         -qr_mechanics_mat_type aij|hypre|nest: storage of the block of mechanics; hypre, the default where the
             options give that field a PCHYPRE, saves PCHYPRE its own copy; nest, the default where they give
-            it a `ComponentSweep`, makes no copy at all.
+            it a `ComponentSweep` and the ranks have more than `FEW_ROWS` rows each, makes no copy at all.
         -qr_pc_type, ...: the inner PC, whose fields are contact, mechanics, intf_flow, mass.
 
     The operator must be a MatNest over the five fields, or those of them that a scene has.
@@ -63,11 +67,11 @@ class ContactTransform(WrapperPC):
         if not {("intf_force", "contact"), ("contact", "intf_force")} <= set(blocks):
             self.side = "none"  # J~_11 = J_11, as with all cells open
         eliminated = self._eliminate(blocks, problem)
-        self._contact, self._intf_force = nest.getNestISs()[0][:2]
         inner_members = merge_mechanics(names)
         inner_problem = replace(problem, blocks=eliminated)
-        mat_type = choice(pc, "qr_mechanics_mat_type", _storages(pc))
-        matrix = field_nest(inner_members, eliminated, problem.layout, mat_type)
+        few = _few_rows(problem)
+        mat_type = choice(pc, "qr_mechanics_mat_type", _storages(pc, copied=few))
+        matrix = field_nest(inner_members, eliminated, problem.layout, mat_type, assembled=few)
         return matrix, field_dm(inner_problem, inner_members)
 
     def _eliminate(self, J: Blocks, problem: Problem) -> Blocks:
@@ -85,6 +89,7 @@ class ContactTransform(WrapperPC):
             changed = {("contact", c): (self._transform, J["intf_force", c]) for c in others if ("intf_force", c) in J}
         if changed:
             self._transform.scale(-1)
+            self._source, self._target = self._transform.createVecs()
         for pair, (left, right) in changed.items():
             S[pair] = add_product(J.get(pair), left, right)
         C_inverse = block_diagonal_inverse(S["contact", "contact"], "J~_11, block of contact", problem)
@@ -101,21 +106,30 @@ class ContactTransform(WrapperPC):
         """Y = Q_r P^-1 x (right) or P^-1 Q_l x (left). Collective."""
         if self.side == "right":
             super().apply(pc, x, y)
-            self._add(self._contact, self._intf_force, y)
+            self._add_transformed(y)
         elif self.side == "none":
             super().apply(pc, x, y)
         else:
             work = x.copy()
-            self._add(self._intf_force, self._contact, work)
+            self._add_transformed(work)
             super().apply(pc, work, y)
             work.destroy()
 
-    def _add(self, source: PETSc.IS, target: PETSc.IS, v: PETSc.Vec) -> None:
-        """v[target] += transform * v[source]."""
-        a, b = v.getSubVector(source), v.getSubVector(target)
-        self._transform.multAdd(a, b, b)
-        v.restoreSubVector(target, b)
-        v.restoreSubVector(source, a)
+    def _add_transformed(self, v: PETSc.Vec) -> None:
+        """v_2 += T v_1 (right) or v_1 += L v_2 (left), in place. Collective.
+
+        The two fields are the first ones of v on each rank. VecGetSubVector would ask all ranks whether they are.
+        """
+        values = v.getArray()
+        sizes = self._source.getLocalSize(), self._target.getLocalSize()
+        places = (slice(0, sizes[0]), slice(sizes[0], sum(sizes)))
+        if self.side == "left":
+            places = (slice(sizes[1], sum(sizes)), slice(0, sizes[1]))
+        self._source.placeArray(values[places[0]])
+        self._target.placeArray(values[places[1]])
+        self._transform.multAdd(self._source, self._target, self._target)
+        self._source.resetArray()
+        self._target.resetArray()
 
     def describe(self) -> str:
         """The transformation in one line."""
@@ -123,11 +137,18 @@ class ContactTransform(WrapperPC):
         return f"inner PC on {where} with the exact Schur complement of contact"
 
 
-def _storages(pc: PETSc.PC) -> tuple[str, ...]:
+def _few_rows(problem: Problem) -> bool:
+    """Whether mechanics is so small that messages cost more than copies of blocks. Local, the same on all ranks."""
+    layout = problem.layout
+    return sum(layout.sizes(f)[1] for f in layout.fields if f in MECHANICS) <= FEW_ROWS * layout.comm.size
+
+
+def _storages(pc: PETSc.PC, *, copied: bool) -> tuple[str, ...]:
     """Storages for the block of mechanics, the best for the inner solver first. Local.
 
     Others than AIJ serve where the inner solver only ever hands the block to a PC that knows them. Schur
-    complements that PETSc assembles multiply matrices, which it can in AIJ only.
+    complements that PETSc assembles multiply matrices, which it can in AIJ only. A `ComponentSweep` takes its parts out
+    of one AIJ by a third of the messages that the blocks of a MatNest take, and `copied` says that this decides.
     """
     prefix = (pc.getOptionsPrefix() or "") + ContactTransform.prefix
     leaf = "fieldsplit_mechanics_"
@@ -140,7 +161,7 @@ def _storages(pc: PETSc.PC) -> tuple[str, ...]:
         best = "hypre"
     elif not assembling and kinds == {"python"}:
         types = {chosen.get(f"{level}{leaf}pc_python_type") for level in levels}
-        best = "nest" if types == {"petsc_fs.pc.ComponentSweep"} else "aij"
+        best = "nest" if types == {"petsc_fs.pc.ComponentSweep"} and not copied else "aij"
     return (best, *(kind for kind in ("aij", "hypre", "nest") if kind != best))
 
 
