@@ -20,7 +20,7 @@ from petsc_fs import hdf5, options
 from petsc_fs.fields import FIELDS
 from petsc_fs.files import write_text
 from petsc_fs.scene import CSR, Scene
-from petsc_fs.tree import CANONICAL
+from petsc_fs.tree import canonical_name
 
 SCENES = Path(__file__).parent / "scenes"
 TREES = ("smallest", "unpruned")
@@ -75,7 +75,7 @@ def _page(
         "# What the smallest tree saves",
         "",
         "Written by `scripts/ablation`: each bundled scene solved by the tree that is cut to fit it, and by the one of",
-        f"`{CANONICAL}` as it is. For the latter a scene is padded with one cell of each field that it lacks,",
+        f"`{canonical_name()}` as it is. For the latter a scene is padded with one cell of each field that it lacks,",
         "which acts on nothing, and all data beside the matrix are computed (rigid-body modes, fixed stress).",
         "(Fields of size zero would not do: the solver drops them, and the file does not fit then.)",
         "Both are held to the relative tolerance, without the absolute one of the file.",
@@ -164,7 +164,7 @@ def _measure(path: Path, kind: str) -> Measurement:
     from petsc_fs.tree import Facts, smallest_tree
 
     scene = hdf5.read(path)
-    canonical = options.parse(options.find_options_file(CANONICAL))
+    canonical = options.parse(options.find_options_file(canonical_name()))
     canonical.pop("ksp_atol", None)  # both trees are held to the relative tolerance
     if kind == "unpruned":
         scene = padded(scene)

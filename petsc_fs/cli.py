@@ -64,6 +64,8 @@ PETSc options follow the scene, for example
   -petsc_fs_partition rcb    which rank gets which cells: auto, rcb, ptscotch or contiguous
   -petsc_fs_mat_type aij     one assembled matrix instead of blocks, for direct solvers
   -petsc_fs_true_rtol 1e-8   tolerance for the true residual, default that of -ksp_rtol
+  -petsc_fs_fallback iterations,direct_mechanics,monolithic   stronger solvers to try in turn where a solve
+      fails; also regularize, smoother, cycles and direct_mass
 
 exit codes: 0 the true residual of the untransformed system meets the tolerance; 1 it does not, or the
 solve failed; 2 wrong call or option; 3 a scene that cannot be read or does not fit together"""
@@ -272,9 +274,9 @@ def _solve(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> i
 def tree_for(scene: Scene, comm: MPI.Intracomm) -> Tree:
     """The smallest solver tree for a scene, from the canonical options file. Collective."""
     from petsc_fs import options
-    from petsc_fs.tree import CANONICAL, Facts, smallest_tree
+    from petsc_fs.tree import Facts, canonical_name, smallest_tree
 
-    return smallest_tree(options.parse(options.find_options_file(CANONICAL)), Facts.of(scene, comm))
+    return smallest_tree(options.parse(options.find_options_file(canonical_name())), Facts.of(scene, comm))
 
 
 def check_folders(*targets: Path | None) -> None:
@@ -464,13 +466,13 @@ def _options(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) ->
     from mpi4py import MPI
 
     from petsc_fs import hdf5
-    from petsc_fs.tree import CANONICAL
+    from petsc_fs.tree import canonical_name
 
     with together(comm):
         path = find_scene(args.scene)
         tree = tree_for(hdf5.read(path), MPI.COMM_SELF)
     if comm.rank == 0:
-        print(tree.text(f"The smallest solver for {path.name}, cut from {CANONICAL}"), end="", flush=True)
+        print(tree.text(f"The smallest solver for {path.name}, cut from {canonical_name()}"), end="", flush=True)
     return 0
 
 

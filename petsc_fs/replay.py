@@ -16,7 +16,7 @@ from petsc_fs.errors import PetscFsError, UsageError, together
 from petsc_fs.files import write_text
 from petsc_fs.layout import Layout
 from petsc_fs.pattern import UnionPattern
-from petsc_fs.tree import CANONICAL, Facts, Tree, smallest_tree
+from petsc_fs.tree import Facts, Tree, canonical_name, smallest_tree
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -194,7 +194,7 @@ class Player:
             return
         self._forget_solver()
         options.delete_all(self._inserted)
-        self.tree = smallest_tree(options.parse(options.find_options_file(CANONICAL)), facts)
+        self.tree = smallest_tree(options.parse(options.find_options_file(canonical_name())), facts)
         self._inserted = options.insert_all(self.tree.options)
         self._facts = facts
 

@@ -23,8 +23,18 @@ if TYPE_CHECKING:
 Options = dict[str, "str | None"]
 FLOW = ("intf_flow", "mass")
 
-CANONICAL = "contact_poromechanics.opts"
+CANONICAL = "contact_poromechanics_fast.opts"
 """Options file with all levels."""
+
+WITHOUT_HYPRE = "contact_poromechanics_gamg.opts"
+"""The same for a PETSc that lacks hypre."""
+
+
+def canonical_name() -> str:
+    """Name of the options file with all levels that this PETSc can run."""
+    from petsc4py import PETSc
+
+    return CANONICAL if PETSc.Sys.hasExternalPackage("hypre") else WITHOUT_HYPRE
 
 
 @dataclass(frozen=True)
@@ -206,6 +216,8 @@ def smallest_tree(canonical: Mapping[str, str | None], facts: Facts) -> Tree:
         node = _split(level_1, "contact", leaf, node, members) if members else leaf
     node = _without_ksp(node)
     outer = {k: v for k, v in canonical.items() if k.startswith(("ksp_", "petsc_fs_"))}
+    if not facts.mechanics:
+        outer = {k: v for k, v in outer.items() if not k.startswith("petsc_fs_reuse")}
     if not facts.published:
         outer.pop("ksp_atol", None)
     if facts.needs_transform:

@@ -24,7 +24,7 @@ from petsc_fs.scene import contact_state_counts
 
 MPIEXEC = Path(petsc_fs.__path__[0]).parent / "scripts" / "mpiexec"
 LIMIT = 60
-MISSPELT = "-qr_fieldsplit_1_fieldsplit_mechanics_pc_hypre_boomeramg_stong_threshold"
+MISSPELT = "-qr_fieldsplit_1_fieldsplit_mechanics_component_pc_hypre_boomeramg_stong_threshold"
 ENVIRONMENT = dict(os.environ, OMP_NUM_THREADS="1")
 """As this session was started: MPI has added to what a process below it would get otherwise."""
 
@@ -191,6 +191,21 @@ def test_a_solve_that_stops_early_is_reported_and_exits_1(tmp_path, ranks):
     report = json.loads((tmp_path / "r.json").read_text())
     assert (report["converged"], report["iterations"], report["reason"]) == (False, 2, "DIVERGED_MAX_IT")
     assert report["true_relative_residual"] > report["tolerance"]
+
+
+@pytest.mark.parametrize("ranks", [1, 2], ids=["1_rank", "2_ranks"])
+def test_a_fallback_is_told_and_hides_no_misspelt_option(tmp_path, ranks):
+    words = ["solve", "flow.h5", "-ksp_max_it", "2", "-petsc_fs_fallback", "direct_mechanics,monolithic"]
+    done = run(*words, "--report", "report.json", cwd=tmp_path, ranks=ranks)
+    assert done.returncode == 0, done.stderr
+    assert "fallback direct_mechanics: no level that it could strengthen, skipped" in done.stdout
+    assert "fallback monolithic on the whole system: " in done.stdout
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["fallback"] == "monolithic"
+    assert "pc_factor_mat_solver_type" not in report["options"]
+    done = run(*words, MISSPELT, "0.5", cwd=tmp_path, ranks=ranks)
+    assert done.returncode == 2
+    assert [line for line in ours(done, ranks) if MISSPELT in line]
 
 
 @pytest.mark.parametrize("ranks", [1, 2], ids=["1_rank", "2_ranks"])

@@ -94,7 +94,11 @@ def test_every_tree_ends_at_the_direct_solver(solver, name, file):
 @pytest.mark.parametrize(
     ("file", "rung", "where"),
     [
-        (TREE, "smoother", [MECHANICS, f"{FLOW}fieldsplit_intf_flow_", f"{FLOW}fieldsplit_mass_"]),
+        (
+            "contact_poromechanics.opts",
+            "smoother",
+            [MECHANICS, f"{FLOW}fieldsplit_intf_flow_", f"{FLOW}fieldsplit_mass_"],
+        ),
         (FAST, "cycles", [f"{MECHANICS}component_", f"{FLOW}fieldsplit_mass_"]),
         (FAST, "direct_mechanics", [MECHANICS]),
         (TREE, "direct_mass", [f"{FLOW}fieldsplit_mass_"]),

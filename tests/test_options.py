@@ -143,12 +143,12 @@ def test_a_file_fits_its_fields_in_any_order_no_more_and_no_fewer(opts):
 
 
 DEFAULTS = {
-    "model1": "contact_poromechanics.opts",
-    "model2": "contact_poromechanics.opts",
-    "model3": "contact_poromechanics.opts",
-    "contact": "contact_mechanics.opts",
-    "biot": "poromechanics.opts",
-    "flow": "flow.opts",
+    "model1": "contact_poromechanics_fast.opts",
+    "model2": "contact_poromechanics_fast.opts",
+    "model3": "contact_poromechanics_fast.opts",
+    "contact": "contact_mechanics_fast.opts",
+    "biot": "poromechanics_fast.opts",
+    "flow": "flow_fast.opts",
 }
 
 

@@ -305,11 +305,14 @@ PAIRS = [
     if options.parse(file.path).get("pc_type") != "lu"  # iterations of direct solvers are rounding errors
 ]
 
+MORE = {("flow_fast.opts", "flow"): 1}
+"""Iterations beyond that: 10 on one rank, 12 on two, where HMIS coarsens otherwise along the boundary between ranks."""
+
 
 @pytest.mark.mpi
 @pytest.mark.parametrize(("file", "name"), PAIRS, ids=["-".join(pair).replace(".opts", "") for pair in PAIRS])
 def test_iterations_do_not_depend_on_ranks(database, file, name):
-    """Within 10 %, rounded up to a whole iteration; or within two of them, where there are few."""
+    """Within 10 %, rounded up to a whole iteration."""
     database(file)
     if file == "fixed_stress_richardson.opts":
         from petsc4py import PETSc
@@ -321,4 +324,4 @@ def test_iterations_do_not_depend_on_ranks(database, file, name):
     alone = comm.bcast(Solver(scene, MPI.COMM_SELF).solve().iterations if comm.rank == 0 else 0)
     result = Solver(scene).solve()
     assert result.converged
-    assert result.iterations <= max(math.ceil(1.1 * alone), alone + 2)
+    assert result.iterations <= math.ceil(1.1 * alone) + MORE.get((file, name), 0)

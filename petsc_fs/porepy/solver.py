@@ -32,7 +32,7 @@ from petsc_fs.forcing import EisenstatWalker, EisenstatWalkerParameters
 from petsc_fs.memory import return_freed
 from petsc_fs.pattern import UnionPattern
 from petsc_fs.scene import Scene, contact_state_counts
-from petsc_fs.tree import CANONICAL, Facts, Tree, smallest_tree
+from petsc_fs.tree import Facts, Tree, canonical_name, smallest_tree
 
 if TYPE_CHECKING:
     from petsc_fs.porepy.adapter import Adapter
@@ -145,7 +145,7 @@ class FieldSplitSolver:
     From the model's parameters it takes:
 
     - `petsc_fs_options_file`: path of the options file, or name of a shipped one; default is the smallest
-      solver for the fields and couplings of the model, cut from contact_poromechanics.opts;
+      solver for the fields and couplings of the model, cut from contact_poromechanics_fast.opts;
     - `petsc_fs_options_prefix`: put before all option names, default "".
 
     The options of the file are in PETSc's database only while a system is being solved, and what
@@ -269,7 +269,7 @@ class FieldSplitSolver:
             facts = facts.or_either(self._facts)
         if self._chosen is None or facts != self._facts:
             self._forget_solver()
-            tree = smallest_tree(options.parse(options.find_options_file(CANONICAL)), facts)
+            tree = smallest_tree(options.parse(options.find_options_file(canonical_name())), facts)
             self._chosen, self._facts = _Chosen(tree.options, tree=tree), facts
         return self._chosen
 
@@ -326,9 +326,13 @@ class FieldSplitSolver:
         """Solve, and do what -petsc_fs_on_failure says where the tolerance is missed."""
         policy = self._option("petsc_fs_on_failure", ON_FAILURE)
         outcome = self._attempt(scene, rtol, retry=policy == "retry")
-        if not outcome.failure:
-            return outcome
         where = f"time step {scene.metadata.time_step_index}, Newton step {scene.metadata.newton_index}"
+        if not outcome.failure:
+            notes = () if outcome.result is None else outcome.result.notes
+            rungs = [note for note in notes if note.startswith("fallback ")]
+            if rungs:
+                logger.warning("%s: %s", where, "; ".join(rungs))
+            return outcome
         if policy == "retry":
             logger.warning("%s: %s; solving again by stronger means", where, outcome.failure)
             return self._second_attempt(scene, rtol, outcome, where)
