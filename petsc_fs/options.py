@@ -15,13 +15,15 @@ import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from petsc_fs.errors import UsageError
 from petsc_fs.fields import FIELD_NAMES, in_order
 
 if TYPE_CHECKING:
     from petsc_fs.tree import LeftOut
+
+Number = TypeVar("Number", int, float)
 
 OWN = (
     "petsc_fs_mat_type",
@@ -221,6 +223,24 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as e:
         raise UsageError(f"options file {path}: not readable as text: {e}") from e
+
+
+def number(name: str, default: Number, prefix: str = "") -> Number:
+    """An option of this package as a number, a whole one where the default is. Local.
+
+    Raises:
+        UsageError: it is no such number.
+    """
+    from petsc4py import PETSc
+
+    given = PETSc.Options(prefix)
+    whole = isinstance(default, int)
+    try:
+        found: Number = given.getInt(name, default) if whole else given.getReal(name, default)
+        return found
+    except PETSc.Error:
+        expected = "a whole number" if whole else "a number"
+        raise UsageError(f"-{prefix}{name} {given.getString(name, '')}: expected {expected}") from None
 
 
 def unused() -> list[str]:

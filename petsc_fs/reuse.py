@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petsc_fs.errors import UsageError
+from petsc_fs.options import number
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -96,21 +97,15 @@ class Reuse:
         """
         from petsc4py import PETSc
 
-        from petsc_fs.petsc_errors import translate
-
-        options = PETSc.Options(prefix)
-        level = options.getString("petsc_fs_reuse", LEVELS[0])
+        level = PETSc.Options(prefix).getString("petsc_fs_reuse", LEVELS[0])
         if level not in LEVELS:
             raise UsageError(f"-{prefix}petsc_fs_reuse {level}: expected {' or '.join(LEVELS)}")
         default = Triggers()
-        try:
-            triggers = Triggers(
-                changed=options.getReal("petsc_fs_reuse_changed", default.changed),
-                growth=options.getReal("petsc_fs_reuse_growth", default.growth),
-                age=options.getInt("petsc_fs_reuse_age", default.age),
-            )
-        except PETSc.Error as e:  # no number
-            raise translate(e, "options") from None
+        triggers = Triggers(
+            changed=number("petsc_fs_reuse_changed", default.changed, prefix),
+            growth=number("petsc_fs_reuse_growth", default.growth, prefix),
+            age=number("petsc_fs_reuse_age", default.age, prefix),
+        )
         return cls(level, triggers)
 
     @property

@@ -140,7 +140,7 @@ class Solver:
         self.reuse = Reuse.from_options(prefix)
         self.fallback = Fallback.from_options(prefix)
         self.stagnation = Stagnation.from_options(prefix)
-        self.regularize = options.getReal("petsc_fs_regularize", 0.0)
+        self.regularize = database.number("petsc_fs_regularize", 0.0, prefix)
         if not 0 <= self.regularize < 1:
             raise UsageError(f"-{prefix}petsc_fs_regularize {self.regularize:g}: expected a number from 0 to below 1")
         self._failure: PetscFsError | None = None  # of the set-up of the present preconditioner
@@ -148,10 +148,10 @@ class Solver:
         self._solved = False  # whether the last solve converged
         self.system, self.ksp = self._build()
         self._set_operators()
-        self.restarts = options.getInt("petsc_fs_restarts", 2)
+        self.restarts = database.number("petsc_fs_restarts", 2, prefix)
         self.rtol = float(self.ksp.getTolerances()[0])
-        self.true_rtol = options.getReal("petsc_fs_true_rtol", self.rtol)
-        self.error_factor = options.getReal("petsc_fs_error_factor", ERROR_FACTOR)
+        self.true_rtol = database.number("petsc_fs_true_rtol", self.rtol, prefix)
+        self.error_factor = database.number("petsc_fs_error_factor", ERROR_FACTOR, prefix)
         self.scaling = options.getString("petsc_fs_scaling", SCALINGS[0])
         if self.scaling not in SCALINGS:
             raise UsageError(f"-{prefix}petsc_fs_scaling {self.scaling}: expected {' or '.join(SCALINGS)}")

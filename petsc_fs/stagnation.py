@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from petsc4py import PETSc
 
 from petsc_fs.errors import UsageError
+from petsc_fs.options import number
 
 WINDOW = 100
 """Default of -petsc_fs_stagnation_window."""
@@ -50,9 +51,8 @@ class Stagnation:
         Raises:
             UsageError: an option has an impossible value.
         """
-        options = PETSc.Options(prefix)
-        window = options.getInt("petsc_fs_stagnation_window", WINDOW)
-        ratio = options.getReal("petsc_fs_stagnation_ratio", RATIO)
+        window = number("petsc_fs_stagnation_window", WINDOW, prefix)
+        ratio = number("petsc_fs_stagnation_ratio", RATIO, prefix)
         if window < 0 or not 0 < ratio <= 1:
             raise UsageError(
                 f"-{prefix}petsc_fs_stagnation_window must not be negative, _ratio be in (0, 1]; "

@@ -281,6 +281,25 @@ def test_gmres_that_stands_still_is_stopped(database):
     assert 30 <= result.iterations < 1000
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        "petsc_fs_restarts",
+        "petsc_fs_true_rtol",
+        "petsc_fs_error_factor",
+        "petsc_fs_regularize",
+        "petsc_fs_stagnation_window",
+        "petsc_fs_stagnation_ratio",
+        "petsc_fs_reuse_changed",
+        "petsc_fs_reuse_age",
+    ],
+)
+def test_what_is_no_number_is_refused(database, name):
+    database("flow.opts", **{name: "many"})
+    with pytest.raises(UsageError, match=f"-{name} many: expected a.* number"):
+        Solver(load("flow"))
+
+
 @pytest.mark.parametrize("value", [{"petsc_fs_stagnation_window": "-1"}, {"petsc_fs_stagnation_ratio": "1.5"}])
 def test_impossible_stagnation_is_refused(database, value):
     database("contact_poromechanics.opts", **value)

@@ -18,7 +18,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -311,13 +311,10 @@ class FieldSplitSolver:
         if self._option("petsc_fs_forcing", FORCING) == "fixed":
             return None
         if self._forcing is None:
-            from petsc4py import PETSc
-
-            given = PETSc.Options(f"{self._options_prefix}petsc_fs_ew_")
-            names = {f.name: f.default for f in fields(EisenstatWalkerParameters)}
-            self._forcing = EisenstatWalker(
-                EisenstatWalkerParameters(**{name: given.getReal(name, default) for name, default in names.items()})
-            )
+            prefix = f"{self._options_prefix}petsc_fs_ew_"
+            defaults: dict[str, float] = asdict(EisenstatWalkerParameters())
+            given = {name: options.number(name, default, prefix) for name, default in defaults.items()}
+            self._forcing = EisenstatWalker(EisenstatWalkerParameters(**given))
         return self._forcing.term(residual, self._newton_tolerance)
 
     # Solving
