@@ -33,6 +33,9 @@ from petsc_fs.scene import CSR, Floats, Material, Metadata, Scene
 
 ENCODING = "petsc_fs scene"
 VERSION = 1
+HEAP = b"GCOL"
+HEAPS_WITHIN = 2**24
+"""Bytes at the beginning of a file that are looked through for damaged heaps."""
 PER_CELL = ("cell_centers", "cell_volumes", "cell_dimension", "contact_state")
 
 
@@ -217,6 +220,7 @@ def open_file(path: Path) -> Iterator[h5py.File]:
     if path.is_dir():
         raise SceneError(f"{path}: is a directory, not a scene")
     try:
+        _check_heaps(path)
         file = h5py.File(path, "r")
     except OSError as e:
         if isinstance(e, PermissionError):
@@ -226,6 +230,29 @@ def open_file(path: Path) -> Iterator[h5py.File]:
         raise SceneError(f"{path}: not an HDF5 file, so not a scene; make one with petsc-fs export") from e
     with file, explained(path):
         yield file
+
+
+def _check_heaps(path: Path) -> None:
+    """Refuse a file with a damaged heap, where HDF5 keeps texts: its library may go round in it without end.
+
+    A heap is "GCOL", a version, three zeros and its size in 8 bytes; then follow objects, each a number (2 bytes, 0 for
+    the free space at the end), 6 bytes, its size (8 bytes) and as many bytes, up to a multiple of 8. Heaps are looked
+    for at the beginning of a file, where those of a scene are.
+    """
+    with path.open("rb") as file:
+        data = file.read(HEAPS_WITHIN)
+    start = data.find(HEAP)
+    while start >= 0:
+        size = int.from_bytes(data[start + 8 : start + 16], "little")
+        end, at = start + size, start + 16
+        inside = start % 8 == 0 and data[start + 4 : start + 8] == b"\x01\0\0\0" and end <= len(data)
+        while inside and at + 16 <= end:
+            number, length = (int.from_bytes(data[at + a : at + b], "little") for a, b in ((0, 2), (8, 16)))
+            step = 16 + -(-length // 8) * 8 if number else length
+            if not 16 <= step <= end - at:
+                raise SceneError(f"{path}: the scene is damaged (a heap of texts in it); copy or export it again")
+            at += step
+        start = data.find(HEAP, start + len(HEAP))
 
 
 @contextmanager

@@ -25,6 +25,8 @@ from petsc_fs.errors import SolveError, UsageError
 from petsc_fs.files import write_text
 from petsc_fs.measure import Job, Record, measure
 from petsc_fs.stress_cases import StressCase, catalogue
+from petsc_fs.stress_held_out import held_out
+from petsc_fs.stress_repairs import REPAIRED, variants
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -37,16 +39,16 @@ SAFETY = 100.0
 """What an estimate of the condition number from below may be short of."""
 TOLERANCE = 1e-10
 """Relative tolerance of the shipped options files."""
-SINGULAR_BACKWARD = 1e-8
-"""Componentwise backward error up to which a solution of a singular system counts as one."""
+SINGULAR_BACKWARD = SAFETY * TOLERANCE
+"""Fieldwise backward error up to which a solution of a singular system counts as one: it has no forward error."""
 
 OUTCOMES = {
     "right": "converged, and the relative error of every field is at most "
     f"{SAFETY:g} times its condition number times the tolerance, and {WORST:g}; "
     f"{UNCONDITIONED:g} where the condition number is not known, and if the matrix is singular, "
-    f"the componentwise backward error at most {SINGULAR_BACKWARD:g}",
+    f"the residual of each field at most {SINGULAR_BACKWARD:g} of |J| |x| + |b| in its rows",
     "refusal": "not converged, or an error, and said so",
-    "wrong": "said to be converged, but the error of a field is larger",
+    "wrong": "said to be converged, but the error of a field is larger, or there is no solution",
     "hang": "no end within the time limit",
     "crash": "the process ended without saying why",
 }
@@ -74,6 +76,8 @@ class Truth:
         no_reference: why.
         conditions: see `petsc_fs.conditioning.field_conditions`.
         singular: whether the catalogue says so.
+        solvable: whether there is a solution.
+        held_out: whether the case is held out, see `petsc_fs.stress_held_out`.
     """
 
     name: str
@@ -87,6 +91,8 @@ class Truth:
     no_reference: str
     conditions: dict[str, float]
     singular: bool
+    solvable: bool = True
+    held_out: bool = False
 
 
 @dataclass(frozen=True)
@@ -95,17 +101,19 @@ class Finding:
 
     Attributes:
         case: its name.
-        file: name of the options file, or `SMALLEST` or `SCALED`.
+        file: name of the options file, or `SMALLEST` or `SCALED`, with further options behind it.
         ranks: number of them.
         outcome: one of `OUTCOMES`.
         kind: of `petsc_fs.measure.KINDS`.
         message: what was said.
         iterations: of the outer Krylov method.
         reason: why it stopped.
+        fallback: rung of -petsc_fs_fallback that found the solution; "" if none did.
         true_residual: relative, in the norm that the solver judges by.
+        tolerance: what the solver held it against, `TOLERANCE` at least.
         error_by_field: relative, in natural norms.
         allowed_by_field: the largest errors that count as right.
-        backward_error: normwise and componentwise.
+        backward_error: normwise, componentwise and fieldwise.
         seconds: set-up and solve.
     """
 
@@ -117,7 +125,9 @@ class Finding:
     message: str
     iterations: int | None
     reason: str | None
+    fallback: str
     true_residual: float | None
+    tolerance: float
     error_by_field: dict[str, float] | None
     allowed_by_field: dict[str, float]
     backward_error: dict[str, float] | None
@@ -137,10 +147,11 @@ def prepare(cases: Iterable[StressCase], folder: Path, say: Callable[[str], None
         path = hdf5.write(scene, folder / f"{case.name}.h5", compression=None)
         target, why, conditions = "", "", dict[str, float]()
         try:
-            exact = reference.solve(scene, "direct")
-            target = os.fspath(folder / f"{case.name}.npz")
-            reference.write(exact, target)
-            conditions = conditioning.field_conditions(scene, exact.solution)
+            with np.errstate(all="ignore"):  # what is not finite is looked for
+                exact = reference.solve(scene, "direct")
+                target = os.fspath(folder / f"{case.name}.npz")
+                reference.write(exact, target)
+                conditions = conditioning.field_conditions(scene, exact.solution)
         except (SolveError, FloatingPointError) as e:
             why = str(e)
         found.append(
@@ -156,6 +167,8 @@ def prepare(cases: Iterable[StressCase], folder: Path, say: Callable[[str], None
                 no_reference=why,
                 conditions=conditions,
                 singular=case.singular,
+                solvable=case.solvable,
+                held_out=case.held_out,
             )
         )
     say(f"{len(found)} scenes, {sum(bool(t.reference) for t in found)} with a reference solution")
@@ -175,6 +188,7 @@ def run(
     *,
     names: Sequence[str] | None = None,
     more: Mapping[str, str | None] | None = None,
+    label: str = "",
     time_limit: float = 60.0,
     mpiexec: str | None = None,
     say: Callable[[str], None] = lambda line: None,
@@ -188,6 +202,7 @@ def run(
         ranks: of each process.
         names: options files to use; None for all that fit.
         more: PETSc options, which win over the files.
+        label: what these are called behind the name of the file.
         time_limit: seconds without a sign of life after which a solve counts as hanging.
         mpiexec: program that starts ranks.
         say: called with a line per options file.
@@ -211,13 +226,14 @@ def run(
             records = measure(job, mpiexec=mpiexec)
             by_path = {t.path: t for t in left}
             for record in records:
-                finding = judge(by_path[record["scene"]], file, ranks, record)
+                finding = judge(by_path[record["scene"]], file + label, ranks, record)
                 counts[finding.outcome] += 1
                 yield finding
             done = {record["scene"] for record in records}
             left = [t for t in left if t.path not in done]
         words = ", ".join(f"{n} {outcome}" for outcome, n in counts.items())
-        say(f"{file} on {ranks} rank{'s' if ranks > 1 else ''}: {words}; {time.perf_counter() - started:.0f} s")
+        where = f"{ranks} rank{'s' if ranks > 1 else ''}"
+        say(f"{file}{label} on {where}: {words}; {time.perf_counter() - started:.0f} s")
 
 
 def judge(truth: Truth, file: str, ranks: int, record: Record) -> Finding:
@@ -228,12 +244,14 @@ def judge(truth: Truth, file: str, ranks: int, record: Record) -> Finding:
     errors, kind = record["error_by_field"], record["kind"]
     if kind in ("hang", "crash"):
         outcome = kind
-    elif kind not in ("converged", "unused_option"):
+    elif kind != "converged":
         outcome = "refusal"
+    elif not truth.solvable:
+        outcome = "wrong"
     elif errors is not None and truth.reference:
         outcome = "right" if all(errors[f] <= allowed[f] for f in errors) else "wrong"
     else:
-        backward = (record["backward_error"] or {}).get("componentwise", np.inf)
+        backward = (record["backward_error"] or {}).get("fieldwise", np.inf)
         outcome = "right" if backward <= SINGULAR_BACKWARD else "wrong"
     seconds = [record[key] for key in ("setup_seconds", "solve_seconds")]
     return Finding(
@@ -245,7 +263,9 @@ def judge(truth: Truth, file: str, ranks: int, record: Record) -> Finding:
         message=record["message"],
         iterations=record["iterations"],
         reason=record["reason"],
+        fallback=record["fallback"] or "",
         true_residual=record["true_residual"],
+        tolerance=tolerance,
         error_by_field=errors,
         allowed_by_field=allowed,
         backward_error=record["backward_error"],
@@ -253,32 +273,69 @@ def judge(truth: Truth, file: str, ranks: int, record: Record) -> Finding:
     )
 
 
-def report(truths: Sequence[Truth], findings: Sequence[Finding], command: str) -> dict[str, Any]:
+def report(
+    truths: Sequence[Truth], findings: Sequence[Finding], command: str, repairs: Sequence[Finding] = ()
+) -> dict[str, Any]:
     """Everything, for JSON."""
-    counts = {
-        str(n): dict(Counter(f.outcome for f in findings if f.ranks == n)) for n in sorted({f.ranks for f in findings})
-    }
     cases = [{k: v for k, v in asdict(t).items() if k not in ("path", "reference")} for t in truths]
-    return {"command": command, "counts": counts, "cases": cases, "findings": [asdict(f) for f in findings]}
+    found = {"command": command, "cases": cases, "findings": [asdict(f) for f in findings]}
+    return found | {"repairs": [asdict(f) for f in repairs], "counts": counts(found)}
+
+
+def counts(found: Mapping[str, Any]) -> dict[str, dict[str, int]]:
+    """Number of each outcome by number of ranks."""
+    numbers = sorted({f["ranks"] for f in found["findings"]})
+    return {str(n): dict(Counter(f["outcome"] for f in found["findings"] if f["ranks"] == n)) for n in numbers}
+
+
+def merge(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Several reports as one; where two have the same case, file and ranks, the later one counts."""
+    cases = {case["name"]: case for part in parts for case in part["cases"]}
+    found: dict[str, Any] = {"command": "; ".join(dict.fromkeys(p["command"] for p in parts))}
+    found["cases"] = list(cases.values())
+    for which in ("findings", "repairs"):
+        latest = {(f["file"], f["ranks"], f["case"]): f for part in parts for f in part.get(which, ())}
+        found[which] = list(latest.values())
+    return found | {"counts": counts(found)}
+
+
+def read_report(path: Path) -> dict[str, Any]:
+    """A report as `--report` wrote it.
+
+    Raises:
+        UsageError: it is none.
+    """
+    try:
+        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        if not {"command", "cases", "findings"} <= set(found):
+            raise ValueError("it has no cases")
+    except (OSError, ValueError, TypeError) as e:
+        raise UsageError(f"{path}: not a report of petsc-fs stress ({e})") from e
+    return found
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `petsc-fs stress`."""
     parser.epilog = EPILOG
-    parser.add_argument("--suite", choices=("quick", "full"), default="quick", help="default %(default)s")
+    parser.add_argument("--suite", choices=SUITES, default="quick", help="default %(default)s")
     parser.add_argument("--ranks", type=int, nargs="+", metavar="N", help="numbers of ranks, as -n; default 1")
     parser.add_argument("--only", nargs="+", metavar="CASE", help="these cases instead of a suite")
     parser.add_argument("--files", nargs="+", metavar="FILE", help="these options files only")
+    parser.add_argument("--repairs", action="store_true", help="each repair without and with it, too")
     parser.add_argument("--list", action="store_true", help="print the catalogue and end")
     parser.add_argument("--report", type=Path, metavar="FILE.json", help="write everything that was found")
+    parser.add_argument("--read", type=Path, nargs="+", metavar="FILE.json", help="read reports instead of solving")
     parser.add_argument("--page", type=Path, metavar="FILE.md", help="write it as a page, with a picture beside it")
+    parser.add_argument("--limits", type=Path, metavar="FILE.md", help="write where each options file can be trusted")
     parser.add_argument("--time-limit", type=float, default=60.0, metavar="S", help="of one solve; default %(default)s")
     parser.add_argument("--mpiexec", metavar="PROGRAM", help="that starts ranks")
 
 
+SUITES = ("quick", "full", "held-out")
 EPILOG = """\
--n RANKS says on how many ranks; other PETSc options win over those of the options files. Exit code 1 if an answer was
-wrong, a solve hung or a process crashed; refusals are honest and count as none of these."""
+-n RANKS says on how many ranks; other PETSc options win over those of the options files. The full suite has the
+held-out cases, too. Exit code 1 if an answer was wrong, a solve hung or a process crashed; refusals are honest and
+count as none of these, and so does what comes of solvers without their repairs."""
 
 
 def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
@@ -287,37 +344,55 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
         raise UsageError("stress starts mpiexec itself: call it without, and give it -n RANKS")
     from petsc_fs.cli import check_folders
 
-    check_folders(args.report, args.page)
+    check_folders(args.report, args.page, args.limits)
     numbers, more = split_petsc(petsc)
     cases = _chosen(args)
     if args.list:
         for case in cases:
             print(f"{case.name:32} {case.group:18} {case.hard}  [{case.source}]")
         return 0
-    ranks = sorted({*(args.ranks or ()), *numbers}) or [1]
     started = time.perf_counter()
-    findings: list[Finding] = []
-    with tempfile.TemporaryDirectory(prefix="petsc_fs-stress-") as folder:
-        truths = prepare(cases, Path(folder), _say)
-        for n in ranks:
-            findings += run(
-                truths, n, names=args.files, more=more, time_limit=args.time_limit, mpiexec=args.mpiexec, say=_say
-            )
-    words = f"petsc-fs stress --suite {args.suite} --ranks {' '.join(map(str, ranks))}"
-    found = report(truths, findings, words)
+    if args.read:
+        found = merge([read_report(path) for path in args.read])
+    else:
+        found = _solve(args, cases, sorted({*(args.ranks or ()), *numbers}) or [1], more)
     if args.report is not None:
         write_text(args.report, json.dumps(found, indent=1) + "\n")
     if args.page is not None:
         from petsc_fs.stress_page import write_page
 
         write_page(found, args.page)
-    for finding in findings:
-        if finding.outcome not in ("right", "refusal"):
-            print(f"{finding.outcome.upper()}: {describe(finding)}")
-    for n, counts in found["counts"].items():
-        print(f"{n} rank{'s' if n != '1' else ''}: " + ", ".join(f"{counts.get(o, 0)} {o}" for o in OUTCOMES))
-    print(f"{len(truths)} cases, {len(findings)} solves, {time.perf_counter() - started:.0f} s")
-    return 1 if any(f.outcome not in ("right", "refusal") for f in findings) else 0
+    if args.limits is not None:
+        from petsc_fs.stress_limits import write_limits
+
+        write_limits(found, args.limits)
+    bad = [f for f in found["findings"] if f["outcome"] not in ("right", "refusal")]
+    for finding in bad:
+        print(f"{finding['outcome'].upper()}: {describe(Finding(**finding))}")
+    for n, numbers_of in found["counts"].items():
+        print(f"{n} rank{'s' if n != '1' else ''}: " + ", ".join(f"{numbers_of.get(o, 0)} {o}" for o in OUTCOMES))
+    solves = len(found["findings"]) + len(found["repairs"])
+    print(f"{len(found['cases'])} cases, {solves} solves, {time.perf_counter() - started:.0f} s")
+    return 1 if bad else 0
+
+
+def _solve(
+    args: argparse.Namespace, cases: Sequence[StressCase], ranks: Sequence[int], more: Mapping[str, str | None]
+) -> dict[str, Any]:
+    """Run the chosen cases; a report."""
+    findings: list[Finding] = []
+    repaired: list[Finding] = []
+    common: dict[str, Any] = {"time_limit": args.time_limit, "mpiexec": args.mpiexec, "say": _say}
+    with tempfile.TemporaryDirectory(prefix="petsc_fs-stress-") as folder:
+        truths = prepare(cases, Path(folder), _say)
+        for n in ranks:
+            findings += run(truths, n, names=args.files, more=more, **common)
+        if args.repairs:
+            for label, values in variants().items():
+                repaired += run(truths, ranks[0], names=[REPAIRED], more={**values, **more}, label=label, **common)
+    words = f"--only {' '.join(args.only)}" if args.only else f"--suite {args.suite}"
+    words += f" --ranks {' '.join(map(str, ranks))}" + (" --repairs" if args.repairs else "")
+    return report(truths, findings, f"petsc-fs stress {words}", repaired)
 
 
 def describe(finding: Finding) -> str:
@@ -336,7 +411,7 @@ def _chosen(args: argparse.Namespace) -> list[StressCase]:
     Raises:
         UsageError: there is no such case or file.
     """
-    known = {case.name: case for case in catalogue()}
+    known = {case.name: case for case in [*catalogue(), *held_out()]}
     for name in args.only or ():
         if name not in known:
             similar = options.closest(name, known)
@@ -347,6 +422,8 @@ def _chosen(args: argparse.Namespace) -> list[StressCase]:
             raise UsageError(f"no options file {name!r}; there are {', '.join(files)}")
     if args.only:
         return [known[name] for name in args.only]
+    if args.suite == "held-out":
+        return [case for case in known.values() if case.held_out]
     return [case for case in known.values() if args.suite == "full" or case.quick]
 
 

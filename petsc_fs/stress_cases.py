@@ -23,6 +23,8 @@ from petsc_fs.scene import CSR, Scene
 
 COLLECTION = Path(__file__).resolve().parent / "scenes" / "stress" / "scenes.h5.xz"
 """Compressed HDF5 file of the exported scenes: a group for each, equal arrays stored once."""
+HELD_OUT_COLLECTION = COLLECTION.with_name("held_out.h5.xz")
+"""The same for the recipes of `petsc_fs.stress_held_out`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,16 +54,17 @@ class Recipe:
     twist: Mapping[str, Any] = field(default_factory=dict)
 
 
-def _lame(ratio: float) -> dict[str, float]:
-    """First Lamé coefficient for a Poisson's ratio, with the model's shear modulus."""
-    return {"lame_lambda": 2 * 1.2e10 * ratio / (1 - 2 * ratio)}
+def lame(ratio: float, shear_modulus: float = 1.2e10) -> dict[str, float]:
+    """Lamé coefficients for a Poisson's ratio and a shear modulus, by default the model's."""
+    return {"shear_modulus": shear_modulus, "lame_lambda": 2 * shear_modulus * ratio / (1 - 2 * ratio)}
 
 
 def _stiffness(factor: float) -> dict[str, float]:
     return {"shear_modulus": 1.2e10 * factor, "lame_lambda": 1.2e10 * factor}
 
 
-def _opening(width: float) -> dict[str, float]:
+def opening(width: float) -> dict[str, float]:
+    """Rock data for fractures of a width in m."""
     return {"residual_aperture": width, "fracture_gap": width, "maximum_elastic_fracture_opening": width / 2}
 
 
@@ -181,28 +184,28 @@ RECIPES: dict[str, Recipe] = {
         model="model1",
         hard="hairline fractures: cells of the fracture with a volume of 1e-8",
         parameters={"fracture_permeability": "cubic"},
-        rock=_opening(1e-8),
+        rock=opening(1e-8),
     ),
     "aperture_1e-1": Recipe(
         group=FLOW,
         model="model1",
         hard="wide fractures by the cubic law",
         parameters={"fracture_permeability": "cubic"},
-        rock=_opening(1e-1),
+        rock=opening(1e-1),
     ),
     "poisson_0.49": Recipe(
         group=ROCK,
         model="model1",
         step=(1, 0),
         hard="nearly incompressible rock, Poisson's ratio 0.49",
-        rock=_lame(0.49),
+        rock=lame(0.49),
     ),
     "poisson_0.4999": Recipe(
         group=ROCK,
         model="model1",
         step=(1, 0),
         hard="nearly incompressible rock, Poisson's ratio 0.4999",
-        rock=_lame(0.4999),
+        rock=lame(0.4999),
     ),
     "stiffness_1e-6": Recipe(
         group=ROCK, model="model1", hard="rock like mud: E 1e6 times smaller", rock=_stiffness(1e-6)
@@ -310,14 +313,14 @@ RECIPES: dict[str, Recipe] = {
 
 
 @cache
-def _collection() -> Any:
+def _collection(path: Path) -> Any:
     """The exported scenes, as an open HDF5 file in memory."""
     import h5py
 
     try:
-        return h5py.File(io.BytesIO(lzma.decompress(COLLECTION.read_bytes())), "r")
+        return h5py.File(io.BytesIO(lzma.decompress(path.read_bytes())), "r")
     except (OSError, lzma.LZMAError) as e:
-        raise SceneError(f"{COLLECTION}: cannot be read ({e}); make it anew with scripts/stress_scenes") from e
+        raise SceneError(f"{path}: cannot be read ({e}); make it anew with scripts/stress_scenes") from e
 
 
 def load(name: str) -> Scene:
@@ -328,9 +331,10 @@ def load(name: str) -> Scene:
     """
     if name.endswith(".h5"):
         return hdf5.read(COLLECTION.parent.parent / name)
-    file = _collection()
+    path = COLLECTION if name in RECIPES else HELD_OUT_COLLECTION
+    file = _collection(path)
     if name not in file:
-        raise SceneError(f"{COLLECTION}: has no scene {name!r}; make it anew with scripts/stress_scenes")
+        raise SceneError(f"{path}: has no scene {name!r}; make it anew with scripts/stress_scenes")
     return hdf5.read_group(file[name])
 
 
@@ -349,17 +353,28 @@ def scaled(scene: Scene, rows: Rows | None = None, columns: Rows | None = None) 
     return replace(scene, blocks=blocks, rhs=rhs, reference={})
 
 
+def base_units(scene: Scene, kg: float, m: float, s: float) -> tuple[float, float, float]:
+    """The scene's units of mass, length and time, counted in others."""
+    old = scene.metadata.units
+    return old.get("kg", 1.0) / kg, old.get("m", 1.0) / m, old.get("s", 1.0) / s
+
+
+def unknowns_in_units(scene: Scene, *, kg: float = 1.0, m: float = 1.0, s: float = 1.0) -> dict[str, float]:
+    """What the unknowns of each field are multiplied by in other units; tractions are relative ones."""
+    mass, length, time = base_units(scene, kg, m, s)
+    known = {"intf_force": length, "momentum": length, "intf_flow": length**3 / time, "mass": mass / length / time**2}
+    return {f: known.get(f, 1.0) for f in scene.fields}
+
+
 def in_units(scene: Scene, *, kg: float = 1.0, m: float = 1.0, s: float = 1.0) -> Scene:
     """The same scene with mass, length and time counted in other units.
 
     Exact but for rounding: every equation and unknown is multiplied by a number, and so are all data.
     """
-    mass = scene.metadata.units.get("kg", 1.0) / kg
-    length, time = scene.metadata.units.get("m", 1.0) / m, scene.metadata.units.get("s", 1.0) / s
+    mass, length, time = base_units(scene, kg, m, s)
     force, pressure = mass * length / time**2, mass / length / time**2
     rows = {"intf_force": force, "momentum": force, "intf_flow": length**3 / time, "mass": mass / time}
-    columns = {"intf_force": length, "momentum": length, "intf_flow": length**3 / time, "mass": pressure}
-    found = scaled(scene, rows, columns)
+    found = scaled(scene, rows, unknowns_in_units(scene, kg=kg, m=m, s=s))
     if found.material is not None:
         old = found.material
         found.material = replace(
@@ -483,6 +498,8 @@ class StressCase:
         make: the scene.
         quick: whether `--suite quick` has it.
         singular: whether the matrix is singular, so that no solution or no single one exists.
+        solvable: whether there is a solution, so that one that is handed on can be right.
+        held_out: whether no threshold was chosen on it, see `petsc_fs.stress_held_out`.
     """
 
     name: str
@@ -492,6 +509,8 @@ class StressCase:
     make: Callable[[], Scene]
     quick: bool = False
     singular: bool = False
+    solvable: bool = True
+    held_out: bool = False
 
 
 QUICK = (
@@ -506,13 +525,19 @@ def _transformed() -> list[StressCase]:
     found: list[StressCase] = []
 
     def add(  # noqa: PLR0917
-        name: str, group: str, hard: str, base: str, change: Callable[[Scene], Scene], singular: bool = False
+        name: str,
+        group: str,
+        hard: str,
+        base: str,
+        change: Callable[[Scene], Scene],
+        singular: bool = False,
+        solvable: bool = True,
     ) -> None:
         words = f"{base}, {(change.func if isinstance(change, partial) else change).__name__.strip('<>')}"
         found.append(
             StressCase(
                 name=name, group=group, hard=hard, source=words, make=lambda: change(load(base)), quick=name in QUICK,
-                singular=singular,
+                singular=singular, solvable=solvable,
             )
         )  # fmt: skip
 
@@ -588,7 +613,7 @@ def _transformed() -> list[StressCase]:
     add("zero_equation", ALGEBRA, "one equation is lost: singular", "base",
         partial(without_row, name="mass", row=5), singular=True)  # fmt: skip
     add("contradiction", ALGEBRA, "the same equation twice with different right-hand sides: no solution", "base",
-        partial(with_row_twice, name="mass", consistent=False), singular=True)  # fmt: skip
+        partial(with_row_twice, name="mass", consistent=False), singular=True, solvable=False)  # fmt: skip
     add("repetition", ALGEBRA, "the same equation twice: many solutions", "base",
         partial(with_row_twice, name="mass", consistent=True), singular=True)  # fmt: skip
     return found

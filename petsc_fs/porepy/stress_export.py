@@ -22,10 +22,12 @@ from petsc_fs.files import complete
 from petsc_fs.porepy.cases import CASES, SIDE, ModelParameters, Rock
 from petsc_fs.scene import Scene, contact_state_counts
 from petsc_fs.stress_cases import RECIPES, Recipe
+from petsc_fs.stress_held_out import HELD_OUT
 
 Progress = Callable[[str], None]
 SEED = 7
 """Of random fields."""
+KNOWN: dict[str, Recipe] = RECIPES | HELD_OUT
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,7 +168,7 @@ def write_collection(
 
     Args:
         target: of the file, replaced if it exists.
-        names: which of `RECIPES`.
+        names: which of `KNOWN`.
         keep: take from an existing file the scenes that it has already.
         progress: called with a line of text per scene.
 
@@ -178,14 +180,14 @@ def write_collection(
     path, failures = Path(target), dict[str, str]()
     if keep and path.exists():
         with h5py.File(io.BytesIO(lzma.decompress(path.read_bytes())), "r") as file:
-            scenes = {name: hdf5.read_group(file[name]) for name in file if name in RECIPES}
+            scenes = {name: hdf5.read_group(file[name]) for name in file if name in KNOWN}
     for name in names:
-        if name not in RECIPES:
-            raise UsageError(f"no recipe {name!r}; there are {', '.join(RECIPES)}")
+        if name not in KNOWN:
+            raise UsageError(f"no recipe {name!r}; there are {', '.join(KNOWN)}")
         if name in scenes:
             continue
         try:
-            scenes[name] = make_scene(RECIPES[name])
+            scenes[name] = make_scene(KNOWN[name])
         except (PetscFsError, ArithmeticError, ValueError, np.linalg.LinAlgError, RuntimeError) as e:
             failures[name] = f"{type(e).__name__}: {e}"
             say(f"{name}: {failures[name]}")
