@@ -12,9 +12,10 @@ from test_solver import database  # noqa: F401
 import petsc_fs
 from petsc_fs import hdf5
 from petsc_fs.dm import one_matrix
+from petsc_fs.errors import SceneError
 from petsc_fs.layout import Layout, rows_of
 from petsc_fs.pc import contact_transform
-from petsc_fs.scene import Scene
+from petsc_fs.scene import CSR, Scene
 from petsc_fs.solver import Solver
 from petsc_fs.system import System
 
@@ -182,3 +183,14 @@ def test_the_fast_file_needs_at_most_a_few_more_iterations(database, scene):  # 
                 PETSc.Options().delValue(name)
     base, fast = counts.values()
     assert fast <= 1.6 * base
+
+
+def test_a_zero_diagonal_is_refused_before_hypre_crashes_on_it(database):  # noqa: F811
+    database("poromechanics_fast.opts")
+    scene = load("biot")
+    stiffness = scene.blocks["momentum", "momentum"]
+    data = stiffness.data.copy()
+    data[stiffness.indptr[2] : stiffness.indptr[3]] = 0.0
+    blocks = scene.blocks | {("momentum", "momentum"): CSR(stiffness.indptr, stiffness.indices, data)}
+    with pytest.raises(SceneError, match="component_: 1 equations of displacements have a zero on the diagonal"):
+        Solver(replace(scene, blocks=blocks)).solve()

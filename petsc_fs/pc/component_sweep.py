@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 from itertools import product
 from typing import Any
 
+import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
-from petsc_fs.errors import LayoutError
+from petsc_fs.errors import LayoutError, SceneError
 from petsc_fs.pc.wrapper import choice
 from petsc_fs.reuse import Reuse
 
@@ -115,6 +118,7 @@ class Sweep:
             inner.setFromOptions()
             matrix = _component(blocks, D, k, k)
             if inner.getType() == "hypre":
+                _check_diagonal(matrix, prefix)
                 aij, matrix = matrix, matrix.convert("hypre", PETSc.Mat())  # else PCHYPRE has a copy beside it
                 aij.destroy()
             inner.setOperators(matrix, matrix)
@@ -165,6 +169,22 @@ class Sweep:
         for vector in (*self._x, *self._y, *self._whole):
             vector.destroy()
         self.inners, self._couplings, self._x, self._y, self._whole = (), {}, [], [], ()
+
+
+def _check_diagonal(matrix: PETSc.Mat, prefix: str) -> None:
+    """Refuse what hypre 2.26 crashes on: equations without an entry, or with zeros alone. Collective."""
+    diagonal = matrix.getDiagonal()
+    zeros = np.flatnonzero(diagonal.getArray() == 0)
+    diagonal.destroy()
+    comm = matrix.comm.tompi4py()
+    number = comm.allreduce(zeros.size)
+    if number:
+        first = comm.allreduce(matrix.getOwnershipRange()[0] + int(zeros[0]) if zeros.size else sys.maxsize, MPI.MIN)
+        raise SceneError(
+            f"-{prefix}: {number} equations of displacements have a zero on the diagonal, the first at cell {first} of "
+            "this level, which multigrid divides by; export the scene again with its elastic stiffness, or use a "
+            "direct solver: -options_file retry.opts"
+        )
 
 
 def _blocks(operator: PETSc.Mat) -> list[list[Any]]:
