@@ -23,6 +23,9 @@ from petsc_fs.forcing import EisenstatWalkerParameters
 RUNS = (("model1", 1.0), ("model1", 2.0), ("model2", 1.0), ("model2", 2.0), ("model3", 0.25))
 """Models and refinements of the page."""
 
+OPTIONS_FILE = "contact_poromechanics.opts"
+"""By which linear systems are solved."""
+
 FORCING = {
     "fixed": {},
     "eisenstat_walker": {"petsc_fs_forcing": "eisenstat_walker"},
@@ -124,6 +127,7 @@ def _run(
             progress(f"{name} {refinement:g} {forcing}: {len(ends)} time steps, {iterations} iterations so far")
 
     model = make_model(name, refinement=refinement, mixins=(Watch, FieldSplitSolver))
+    model.params["petsc_fs_options_file"] = OPTIONS_FILE
     for option, value in FORCING[forcing].items():
         PETSc.Options().setValue(option, value)
     failure = ""
@@ -209,7 +213,8 @@ def _parse(run: str) -> tuple[str, float]:
 PAGE = """\
 # Inexact Newton
 
-Written by `scripts/newton`. Each model runs to its end on one rank with the Newton settings of the paper: line search
+Written by `scripts/newton`. Each model runs to its end on one rank, with `contact_poromechanics.opts`, the published
+configuration, for linear solver, and with the Newton settings of the paper: line search
 on residual and contact constraints, nonlinear tolerance 1e-7 in PorePy's residual norm. In one run all linear systems
 are solved to 1e-10 (`fixed`), in the other as far as `-petsc_fs_forcing eisenstat_walker` says with its defaults:
 rtol0 {p.rtol0:g}, rtolmax {p.rtolmax:g}, gamma {p.gamma:g}, alpha {p.alpha:.3f}, and the guard at the end (see
