@@ -627,17 +627,20 @@ def _all_rhs(scene: Scene, factor: float) -> Scene:
     return replace(scene, rhs={f: factor * v for f, v in scene.rhs.items()}, reference={})
 
 
+def exported(name: str, recipe: Recipe, *, quick: bool = False, held_out: bool = False) -> StressCase:
+    """A case that a PorePy model was exported for."""
+    source = f"PorePy, {recipe.model}, step {recipe.step[0]}:{recipe.step[1]}"
+    return StressCase(
+        name=name,
+        group=recipe.group,
+        hard=recipe.hard,
+        source=source,
+        make=partial(load, name),
+        quick=quick,
+        held_out=held_out,
+    )
+
+
 def catalogue() -> list[StressCase]:
     """All cases, exported scenes first."""
-    exported = [
-        StressCase(
-            name=name,
-            group=recipe.group,
-            hard=recipe.hard,
-            source=f"PorePy, {recipe.model}, step {recipe.step[0]}:{recipe.step[1]}",
-            make=partial(load, name),
-            quick=name in QUICK,
-        )
-        for name, recipe in RECIPES.items()
-    ]
-    return exported + _transformed()
+    return [exported(name, recipe, quick=name in QUICK) for name, recipe in RECIPES.items()] + _transformed()

@@ -17,6 +17,7 @@ from petsc_fs.scene import Scene
 from petsc_fs.stress_cases import (
     Recipe,
     StressCase,
+    exported,
     in_units,
     lame,
     load,
@@ -171,17 +172,7 @@ def _transformed(base: str, number: int) -> Scene:
 
 def held_out() -> list[StressCase]:
     """All held-out cases."""
-    models = [
-        StressCase(
-            name=name,
-            group=recipe.group,
-            hard=recipe.hard,
-            source=f"PorePy, {recipe.model}, step {recipe.step[0]}:{recipe.step[1]}",
-            make=partial(load, name),
-            held_out=True,
-        )
-        for name, recipe in HELD_OUT.items()
-    ]
+    models = [exported(name, recipe, held_out=True) for name, recipe in HELD_OUT.items()]
     for k in range(TRANSFORMED):
         base = BASES[k % len(BASES)]
         models.append(
