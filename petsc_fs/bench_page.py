@@ -106,7 +106,7 @@ def _line(row: Row) -> str:
     cells += [f"{row.iterations}{missed}", f"{row.setup:.3g}", f"{row.solve:.3g}"]
     cells += [f"{row.setup_ratio:.2f}", f"{row.solve_ratio:.2f}"]
     cells += [f"**{row.ratio:.2f}** ({row.lowest:.2f}–{row.highest:.2f})", in_units(row.peak)]
-    cells += [f"{row.complexity:.2f}, {row.mass_complexity:.2f}"]
+    cells += [", ".join("–" if np.isnan(c) else f"{c:.2f}" for c in (row.complexity, row.mass_complexity))]
     known = np.isfinite(row.traffic)
     cells += [in_units(row.traffic) if known else "", f"{row.bandwidth / row.stream:.0%}" if known else ""]
     return f"| {' | '.join([*cells, f'{row.python_share:.1%}'])} |"
