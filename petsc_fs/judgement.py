@@ -140,7 +140,7 @@ def judge(  # noqa: PLR0917
     relative = residual.norm() / size
     where = ""
     if reason in NOT_FINITE or not math.isfinite(relative):
-        where = broken_level(ksp.getPC()) or _overflow(system)
+        where = broken_level(ksp.getPC()) or _overflow(system, ksp)
     if not math.isfinite(relative):
         residual.destroy()
         raise SolveError(
@@ -237,11 +237,25 @@ def _remaining(system: System, ksp: PETSc.KSP, residual: PETSc.Vec, correction: 
     return {f: 1.0 / max(1.0 - q, EPS) for f, q in shrunk.items()}
 
 
-def _overflow(system: System) -> str:
-    """The fields whose right-hand side is too large to have a norm; "" if there are none. Collective."""
-    norms = system.field_norms(system.by_field(system.b))
-    found = [f for f, norm in norms.items() if not math.isfinite(norm)]
-    return f"the norm of the right-hand side overflows in {', '.join(found)}: scale the equations" if found else ""
+def _overflow(system: System, ksp: PETSc.KSP) -> str:
+    """The fields in which b, M^-1 b or J M^-1 b is too large to have a norm; "" if there are none. Collective."""
+    found = _without_norm(system, system.b)
+    if found:
+        return f"the norm of the right-hand side overflows in {found}: scale the equations"
+    x, y = system.b.duplicate(), system.b.duplicate()
+    apply_preconditioner(ksp, system.b, x)
+    what, found = "what the preconditioner makes of the right-hand side", _without_norm(system, x)
+    if not found:
+        system.J.mult(x, y)
+        what = "the product of the Jacobian with what the preconditioner makes of the right-hand side"
+        found = _without_norm(system, y)
+    x.destroy()
+    y.destroy()
+    return f"{what} is not finite in {found}: look for entries that are too large there" if found else ""
+
+
+def _without_norm(system: System, x: PETSc.Vec) -> str:
+    return ", ".join(f for f, norm in system.field_norms(system.by_field(x)).items() if not math.isfinite(norm))
 
 
 def _scaling(system: System) -> str:

@@ -305,8 +305,9 @@ PAIRS = [
     if options.parse(file.path).get("pc_type") != "lu"  # iterations of direct solvers are rounding errors
 ]
 
-MORE = {("flow_fast.opts", "flow"): 1}
-"""Iterations beyond that: 10 on one rank, 12 on two, where HMIS coarsens otherwise along the boundary between ranks."""
+MORE = {("flow_fast.opts", "flow"): 1, ("contact_poromechanics_gamg.opts", "model1"): 1}
+"""Iterations beyond that, where multigrid coarsens otherwise along the boundary between ranks: with HMIS 10 on one rank
+and 12 on two, with GAMG 29 on one and 33 on four."""
 
 
 @pytest.mark.mpi
@@ -320,6 +321,7 @@ def test_iterations_do_not_depend_on_ranks(database, file, name):
         # Its absolute tolerance lies below what rounding in the factorisations leaves of model1's preconditioned
         # residual, which wanders between 1e-10 and 2e-9 then: where it stops there is chance.
         PETSc.Options().setValue("ksp_atol", 1e-8)
+        PETSc.Options().setValue("petsc_fs_error_factor", 0)  # whether it starts again would be chance, too
     scene = load(name)
     alone = comm.bcast(Solver(scene, MPI.COMM_SELF).solve().iterations if comm.rank == 0 else 0)
     result = Solver(scene).solve()
