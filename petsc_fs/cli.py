@@ -88,7 +88,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as e:  # --help
         return int(e.code or 0)
     except PetscFsError as e:
-        _let_go(e)
         return _fail(comm, f"petsc-fs: {e}", e.exit_code)
     except KeyboardInterrupt as e:
         return _fail(comm, f"petsc-fs: {str(e) or 'interrupted'}", 130)
@@ -119,14 +118,6 @@ def _is_number(word: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _let_go(error: BaseException | None) -> None:
-    """Free what the frames of an error hold: PETSc's objects have to go on all ranks before PetscFinalize."""
-    while error is not None:
-        traceback.clear_frames(error.__traceback__)
-        error.__traceback__ = None
-        error = error.__cause__ or error.__context__
 
 
 def _fail(comm: MPI.Intracomm, message: str, code: int) -> int:

@@ -51,8 +51,11 @@ def together(comm: MPI.Intracomm) -> Iterator[None]:
     except Exception as e:
         error = e
     first = next((e for e in comm.allgather(error and portable(error)) if e is not None), None)
-    if first is not None:
-        raise first from error
+    try:
+        if first is not None:
+            raise first from error
+    finally:  # or error and frames hold each other, and with them PETSc's objects, beyond PetscFinalize on some ranks
+        del first, error
 
 
 def portable(error: BaseException) -> Exception:
