@@ -161,10 +161,10 @@ def _measure(path: Path, kind: str) -> Measurement:
     from petsc4py import PETSc
 
     from petsc_fs.solver import Solver
-    from petsc_fs.tree import Facts, smallest_tree
+    from petsc_fs.tree import Facts, canonical_options, smallest_tree
 
     scene = hdf5.read(path)
-    canonical = options.parse(options.find_options_file(canonical_name()))
+    canonical = canonical_options()
     canonical.pop("ksp_atol", None)  # both trees are held to the relative tolerance
     if kind == "unpruned":
         scene = padded(scene)

@@ -121,7 +121,17 @@ def residual(scene: Scene, solution: FieldArrays) -> dict[str, Floats]:
     return found
 
 
-def backward_error(scene: Scene, solution: FieldArrays, of: FieldArrays | None = None) -> dict[str, float]:
+def row_magnitudes(scene: Scene, solution: FieldArrays) -> dict[str, Floats]:
+    """|J| |x| + |b| per field, entry by entry: what the terms of each equation amount to before they cancel."""
+    found = {f: np.abs(scene.rhs[f]) for f in scene.fields}
+    for (r, c), block in scene.blocks.items():
+        found[r] = found[r] + multiply(block._replace(data=np.abs(block.data)), np.abs(solution[c]))
+    return found
+
+
+def backward_error(
+    scene: Scene, solution: FieldArrays, of: FieldArrays | None = None, magnitudes: FieldArrays | None = None
+) -> dict[str, float]:
     """By how much the system must be changed for the solution to be exact, relative to the system.
 
     Normwise: |b - J x| / (|J| |x| + |b|) in the maximum norm (Rigal and Gaches, J. ACM 14, 1967). As fields differ in
@@ -131,20 +141,18 @@ def backward_error(scene: Scene, solution: FieldArrays, of: FieldArrays | None =
     Args:
         scene: with all rows.
         solution: all rows of each field.
-        of: the residual, where it is known to better than double precision.
+        of: the residual, where it is known, maybe to better than double precision.
+        magnitudes: see `row_magnitudes`, where they are known.
 
     Returns:
         "normwise" and "componentwise".
     """
-    size = {f: np.abs(scene.rhs[f]) for f in scene.fields}
+    of, magnitudes = of or residual(scene, solution), magnitudes or row_magnitudes(scene, solution)
     rows = {f: np.zeros(n) for f, n in scene.sizes.items()}
-    for (r, c), block in scene.blocks.items():
-        magnitude = block._replace(data=np.abs(block.data))
-        size[r] = size[r] + multiply(magnitude, np.abs(solution[c]))
-        rows[r] += multiply(magnitude, np.ones(scene.sizes[c]))
+    for (name, column), block in scene.blocks.items():
+        rows[name] += multiply(block._replace(data=np.abs(block.data)), np.ones(scene.sizes[column]))
     r, b, scales, sums, x = (
-        np.concatenate([values[f] for f in scene.fields])
-        for values in (of or residual(scene, solution), scene.rhs, size, rows, solution)
+        np.concatenate([values[f] for f in scene.fields]) for values in (of, scene.rhs, magnitudes, rows, solution)
     )
     ratio = np.divide(np.abs(r), scales, out=np.where(r == 0, 0.0, np.inf), where=scales > 0)
     norm = _greatest(sums) * _greatest(x) + _greatest(b)

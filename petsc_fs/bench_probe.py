@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -87,7 +87,7 @@ def main() -> int:
 
 
 class Kept:
-    """A scene, or the steps of a sequence, in memory on the ranks that solve them.
+    """A scene, or the steps of a sequence, in memory on the ranks that solve them, in each distribution asked for.
 
     Attributes:
         steps: of a sequence; empty for a scene.
@@ -97,23 +97,40 @@ class Kept:
 
     def __init__(self, path: Path, comm: MPI.Intracomm) -> None:
         """Read everything. Collective."""
+        from petsc_fs import sequence
+
+        self.path, self.comm = path, comm
+        self.steps: tuple[Step, ...] = sequence.read_contents(path).steps if sequence.is_sequence(path) else ()
+        self._known: dict[tuple[str, str], tuple[list[Scene], Layout]] = {}
+        self.scenes: list[Scene]
+        self.layout: Layout
+        self.distribute()
+
+    def distribute(self) -> None:
+        """Have the rows where and in the order the options database says; reads them unless it did. Collective."""
+        from petsc_fs.partition import chosen
+
+        choice = chosen()
+        if choice not in self._known:
+            self._known[choice] = self._read(*choice)
+        self.scenes, self.layout = self._known[choice]
+
+    def _read(self, kind: str, ordering: str) -> tuple[list[Scene], Layout]:
         from petsc4py import PETSc
 
         from petsc_fs import sequence
         from petsc_fs.distributed_reader import read_distributed
-        from petsc_fs.partition import chosen_kind
 
-        self.path, self.comm = path, comm
-        self.steps: tuple[Step, ...] = sequence.read_contents(path).steps if sequence.is_sequence(path) else ()
-        self.scenes: list[Scene] = []
-        self.layout: Layout | None = None
-        finders: Sequence[Any] = [None]
-        if self.steps:
-            finders = [lambda file, k=step.index: sequence.find_step(file, k) for step in self.steps]
-        for find in finders:
-            more = {} if find is None else {"find": find, "layout": self.layout}
-            scene, self.layout = read_distributed(path, comm, chosen_kind(), index_type=PETSc.IntType, **more)
-            self.scenes.append(scene)
+        finders: Sequence[Any] = [lambda file, k=step.index: sequence.find_step(file, k) for step in self.steps]
+        scenes: list[Scene] = []
+        layout: Layout | None = None
+        for find in finders or [nullcontext]:
+            scene, layout = read_distributed(
+                self.path, self.comm, kind, ordering, layout=layout, index_type=PETSc.IntType, find=find
+            )
+            scenes.append(scene)
+        assert layout is not None
+        return scenes, layout
 
     def describe(self) -> Record:
         """Sizes and entries, of the first step. Collective."""
@@ -137,7 +154,6 @@ class KeptPlayer(Player):
 
     def _read(self, step: Step) -> tuple[Scene, Layout]:
         place = self._kept.steps.index(step)
-        assert self._kept.layout is not None
         return replace(self._kept.scenes[place]), self._kept.layout
 
 
@@ -149,6 +165,7 @@ def _measure(kept: Kept, file: str, job: Record, *, warm_up: bool) -> Record:
     if warm_up:
         chosen |= dict.fromkeys(_statistics_options(chosen), "1")
     inserted = options.insert_all(chosen)
+    kept.distribute()
     gc.collect()
     memory.reset_peak()
     before = memory.held()

@@ -20,6 +20,7 @@ from petsc_fs.compare import (
     verdicts,
 )
 from petsc_fs.files import write_text
+from petsc_fs.markdown import table
 
 ACCURACIES = (1e-3, 1e-6, 1e-9)
 """Forward errors of the tables over scenes."""
@@ -138,10 +139,6 @@ TRUSTED = 1e-6
 """Tolerance of the residual that looks strict."""
 
 
-def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    return [f"| {' | '.join(row)} |" for row in (headings, ["---"] * len(headings), *rows)]
-
-
 def _name(case: Case) -> str:
     return f"{case.label} ({case.dimension}D, {case.unknowns:,})"
 
@@ -156,7 +153,7 @@ def _verdict_table(rows: Sequence[tuple[Comparison, Verdict]]) -> list[str]:
             ties = f" ≈ {', '.join(winners[0].ties)}" if winners and winners[0].ties else ""
             row.append(f"`{winners[0].file}` {seconds_words(winners)}{ties}" if winners else "none")
         cells.append(row)
-    return _table(["scene (unknowns)", "ranks", "error ≤", *SECONDS], cells)
+    return table(["scene (unknowns)", "ranks", "error ≤", *SECONDS], cells)
 
 
 def _direct_table(comparisons: Sequence[Comparison]) -> list[str]:
@@ -178,7 +175,7 @@ def _direct_table(comparisons: Sequence[Comparison]) -> list[str]:
         f"Set-up and solve on the fewest ranks, to an error of {ACCURACIES[1]:.0e}; memory is the peak of the process."
     )
     headings = ["scene (unknowns)", "best direct solver", "best other file", "seconds, direct / other"]
-    return [words, "", *_table(headings, rows)]
+    return [words, "", *table(headings, rows)]
 
 
 def _direct_and_other(found: Comparison) -> list[tuple[Case, tuple[Fastest | None, Fastest | None]]]:
@@ -209,7 +206,7 @@ def _tolerance_table(comparisons: Sequence[Comparison]) -> list[str]:
                 if mine:
                     cells = [loosest(mine, accuracy) for accuracy in ACCURACIES]
                     rows.append([_name(case), f"`{entry.label}`", *cells])
-    return _table(["scene (unknowns)", "file", *(f"error ≤ {a:.0e}" for a in ACCURACIES)], rows)
+    return table(["scene (unknowns)", "file", *(f"error ≤ {a:.0e}" for a in ACCURACIES)], rows)
 
 
 def loosest(mine: Sequence[Point], accuracy: float) -> str:

@@ -62,6 +62,7 @@ PETSc options follow the scene, for example
   -ksp_rtol 1e-6         relative tolerance      -ksp_monitor   residual at each iteration
   -ksp_view              the solver tree         -log_view      where time goes
   -petsc_fs_partition rcb    which rank gets which cells: auto, rcb, ptscotch or contiguous
+  -petsc_fs_ordering morton  order of the cells of a rank: auto, natural (that of the file), or along a curve
   -petsc_fs_mat_type aij     one assembled matrix instead of blocks, for direct solvers
   -petsc_fs_true_rtol 1e-8   tolerance for the true residual, default that of -ksp_rtol
   -petsc_fs_fallback iterations,direct_mechanics,monolithic   stronger solvers to try in turn where a solve
@@ -224,13 +225,13 @@ def _solve(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> i
 
     from petsc_fs.distributed_reader import read_distributed
     from petsc_fs.memory import Phases, return_freed
-    from petsc_fs.partition import chosen_kind
+    from petsc_fs.partition import chosen
     from petsc_fs.solver import Solver
 
     return_freed()
     phases = Phases()
     started = time.perf_counter()
-    scene, layout = read_distributed(path, comm, chosen_kind(), index_type=PETSc.IntType)
+    scene, layout = read_distributed(path, comm, *chosen(), index_type=PETSc.IntType)
     read_seconds = time.perf_counter() - started
     tree = None
     if options_file is None:
@@ -273,10 +274,9 @@ def _solve(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> i
 
 def tree_for(scene: Scene, comm: MPI.Intracomm) -> Tree:
     """The smallest solver tree for a scene, from the canonical options file. Collective."""
-    from petsc_fs import options
-    from petsc_fs.tree import Facts, canonical_name, smallest_tree
+    from petsc_fs.tree import Facts, shipped_tree
 
-    return smallest_tree(options.parse(options.find_options_file(canonical_name())), Facts.of(scene, comm))
+    return shipped_tree(Facts.of(scene, comm))
 
 
 def check_folders(*targets: Path | None) -> None:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from petsc_fs.accuracy import multiply, residual, weights
+from petsc_fs.accuracy import FieldArrays, residual, row_magnitudes, weights
 from petsc_fs.errors import SolveError
-from petsc_fs.reference import PREFIX, WORKSPACE, database, equilibrate, one_block
+from petsc_fs.options import inserted
+from petsc_fs.reference import PREFIX, WORKSPACE, equilibrate, one_block
 from petsc_fs.scene import Scene
 
 Floats = NDArray[np.float64]
@@ -19,7 +19,7 @@ STEPS = 6
 """Of the power iteration; each costs two solves."""
 
 
-def field_conditions(scene: Scene, solution: Mapping[str, Floats]) -> dict[str, float]:
+def field_conditions(scene: Scene, solution: FieldArrays) -> dict[str, float]:
     """Condition number of each field: relative error of the field per unit of relative residual.
 
     With s_g the norm of |J| |x| + |b| in the rows of field g, S = diag(s_g), and the natural norms of
@@ -62,7 +62,7 @@ def field_conditions(scene: Scene, solution: Mapping[str, Floats]) -> dict[str, 
     random = np.random.default_rng(0)
     found = {}
     try:
-        with database(WORKSPACE if package == "mumps" else {}):
+        with inserted(WORKSPACE if package == "mumps" else {}, PREFIX):
             pc.setFromOptions()
             pc.setUp()
         for name in scene.fields:
@@ -89,7 +89,7 @@ def field_conditions(scene: Scene, solution: Mapping[str, Floats]) -> dict[str, 
     return found
 
 
-def _of_size_one(scene: Scene, solution: Mapping[str, Floats]) -> tuple[Scene, dict[str, Floats]]:
+def _of_size_one(scene: Scene, solution: FieldArrays) -> tuple[Scene, dict[str, Floats]]:
     """The same, with a right-hand side whose largest entry is about 1, so that no square over- or underflows."""
     largest = max((float(np.abs(b).max(initial=0.0)) for b in scene.rhs.values()), default=0.0)
     factor = 2.0 ** -np.frexp(largest)[1] if largest else 1.0
@@ -97,20 +97,28 @@ def _of_size_one(scene: Scene, solution: Mapping[str, Floats]) -> tuple[Scene, d
     return replace(scene, rhs=rhs, reference={}), {f: factor * x for f, x in solution.items()}
 
 
-def magnitudes(scene: Scene, solution: Mapping[str, Floats]) -> dict[str, float]:
+def magnitudes(scene: Scene, solution: FieldArrays) -> dict[str, float]:
     """Norm of |J| |x| + |b| per field."""
-    size = {f: np.abs(scene.rhs[f]) for f in scene.fields}
-    for (r, c), block in scene.blocks.items():
-        size[r] = size[r] + multiply(block._replace(data=np.abs(block.data)), np.abs(solution[c]))
-    return {f: float(np.linalg.norm(v)) for f, v in size.items()}
+    return _norms(row_magnitudes(scene, solution))
 
 
-def fieldwise_backward_error(scene: Scene, solution: Mapping[str, Floats]) -> float:
+def fieldwise_backward_error(
+    scene: Scene, solution: FieldArrays, of: FieldArrays | None = None, magnitudes: FieldArrays | None = None
+) -> float:
     """The largest over the fields of |b - J x| / s_g in its rows, with s_g as for `field_conditions`.
 
     What the condition numbers there bound errors by; it means something where the matrix is singular, too. No scaling
     of equations field by field and no units change it.
+
+    Args:
+        scene: with all rows.
+        solution: all rows of each field.
+        of: the residual, where it is known.
+        magnitudes: see `petsc_fs.accuracy.row_magnitudes`, where they are known.
     """
-    sizes, left = magnitudes(scene, solution), residual(scene, solution)
-    norms = {f: float(np.linalg.norm(r)) for f, r in left.items()}
+    sizes, norms = _norms(magnitudes or row_magnitudes(scene, solution)), _norms(of or residual(scene, solution))
     return max((norms[f] / s if s else float(norms[f] > 0) for f, s in sizes.items()), default=0.0)
+
+
+def _norms(arrays: FieldArrays) -> dict[str, float]:
+    return {f: float(np.linalg.norm(v)) for f, v in arrays.items()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
@@ -35,12 +35,14 @@ class Strengths:
         dense: (cells, block size, block size).
         sizes: (cells,) largest entry of the rows of each block, outside of it too.
         ratios: (cells,) least singular value of each block over its size.
-        usual: the median of `ratios` over all ranks.
+        everywhere: `ratios` of all ranks, in the order of the layout.
+        usual: their median.
     """
 
     dense: NDArray[np.float64]
     sizes: NDArray[np.float64]
     ratios: NDArray[np.float64]
+    everywhere: NDArray[np.float64]
     usual: float
 
     @classmethod
@@ -52,12 +54,14 @@ class Strengths:
         for (r, _), block in blocks.items():
             if r == name:
                 indptr, _, values = block.getValuesCSR()
-                np.maximum.at(rows, np.repeat(np.arange(rows.size), np.diff(indptr)), np.abs(values))
+                filled = np.flatnonzero(np.diff(indptr))
+                if filled.size:
+                    rows[filled] = np.maximum(rows[filled], np.maximum.reduceat(np.abs(values), indptr[filled]))
         sizes = rows.reshape(-1, bs).max(axis=1)
         least = np.linalg.svd(dense, compute_uv=False)[:, -1] if len(dense) else np.zeros(0)
         ratios = np.divide(least, sizes, out=np.zeros_like(least), where=sizes > 0)
         everywhere = np.concatenate(layout.comm.allgather(ratios))
-        return cls(dense, sizes, ratios, float(np.median(everywhere)) if everywhere.size else 0.0)
+        return cls(dense, sizes, ratios, everywhere, float(np.median(everywhere)) if everywhere.size else 0.0)
 
 
 @dataclass(frozen=True)
@@ -117,17 +121,17 @@ def explain_weakness(problem: Problem, scene: Scene) -> list[str]:
     lines = []
     for weak in found:
         cell = int(layout.places(weak.field)[weak.cell])
-        named = Weak(weak.field, weak.cell, weak.ratio, contact_state(layout, scene, weak.field, cell))
+        named = replace(weak, state=contact_state(layout, scene, weak.field, cell))
         lines.append(f"{named}; -petsc_fs_regularize {REMEDY:g} has the preconditioner do without it")
     return lines
 
 
 def _weakest(layout: Layout, blocks: Blocks, name: str) -> Iterator[Weak]:
     strengths = Strengths.of(layout, blocks, name)
-    everywhere = np.concatenate(layout.comm.allgather(strengths.ratios))
-    if strengths.usual and everywhere.min() <= WEAK * strengths.usual:
-        cell = int(everywhere.argmin())
-        yield Weak(name, layout.scene_cell(name, cell), float(everywhere[cell] / strengths.usual))
+    ratios = strengths.everywhere
+    if strengths.usual and ratios.min() <= WEAK * strengths.usual:
+        cell = int(ratios.argmin())
+        yield Weak(name, layout.scene_cell(name, cell), float(ratios[cell] / strengths.usual))
 
 
 def transformed_contact_block(problem: Problem) -> PETSc.Mat | None:

@@ -18,7 +18,7 @@ from petsc_fs import hdf5
 from petsc_fs.errors import LayoutError, SceneError, together
 from petsc_fs.fields import FIELD
 from petsc_fs.layout import Cells, Layout, rows_of
-from petsc_fs.partition import Coupling, Places, graph_block, layout_of, needed, parts_of, primary_field
+from petsc_fs.partition import Coupling, Places, fit_cache, graph_block, layout_of, needed, parts_of, primary_field
 from petsc_fs.redistribution import Redistribution, Transfer, run, shares
 from petsc_fs.scene import CSR, Material, Scene, increasing, renumber
 
@@ -36,6 +36,7 @@ def read_distributed(
     path: str | os.PathLike[str],
     comm: MPI.Intracomm,
     kind: str = "auto",
+    ordering: str = "auto",
     *,
     layout: Layout | None = None,
     index_type: DTypeLike = np.int64,
@@ -54,6 +55,7 @@ def read_distributed(
         path: of the file, the same one for all ranks.
         comm: communicator.
         kind: of partition, see `petsc_fs.partition.parts_of`.
+        ordering: of the cells of a rank, see there too.
         layout: that the rows shall have; no partition is made then.
         index_type: of the column numbers; PETSc's spares it a copy.
         prefix: of the options of graph partitioners.
@@ -80,7 +82,7 @@ def read_distributed(
             reader = _Reader(group, comm, np.dtype(index_type), explained)
         reader.agree()
         reader.read_indptr()
-        chosen = reader.layout(kind, prefix) if layout is None else layout
+        chosen = reader.layout(kind, ordering, prefix) if layout is None else layout
         part = reader.part(chosen)
         with together(comm), explained():
             for problem in reader.disordered:
@@ -161,15 +163,16 @@ class _Reader:
             if own != first:
                 raise SceneError(f"rank {self.comm.rank} sees another scene there than rank 0")
 
-    def layout(self, kind: str, prefix: str) -> Layout:
+    def layout(self, kind: str, ordering: str, prefix: str) -> Layout:
         """Where cells go. Collective."""
         places = Places(self.dimension, self.cells)
-        if self.comm.size > 1 and kind != "contiguous":
+        ordered = ordering == "morton" or (ordering == "auto" and not fit_cache(self.cells, self.comm.size))
+        if kind != "contiguous" and (self.comm.size > 1 or ordered):
             places = self._places(kind)
         parts = None
         with together(self.comm):
             if self.comm.rank == 0:
-                parts = parts_of(places, self.comm.size, kind, prefix)
+                parts = parts_of(places, self.comm.size, kind, ordering, prefix)
         return layout_of(parts, self.comm, self.dimension)
 
     def _places(self, kind: str) -> Places:

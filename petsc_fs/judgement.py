@@ -259,10 +259,9 @@ def _without_norm(system: System, x: PETSc.Vec) -> str:
 
 
 def _scaling(system: System) -> str:
-    scales = system.row_scale
-    if all(scale == 1.0 for scale in scales.values()):
+    if not system.is_scaled:
         return ""
-    return "rows scaled by " + ", ".join(f"{f} {scales[f]:.1e}" for f in system.layout.fields)
+    return "rows scaled by " + ", ".join(f"{f} {system.row_scale[f]:.1e}" for f in system.layout.fields)
 
 
 def _ratios(system: System, part: FieldArrays, whole: FieldArrays) -> dict[str, float]:

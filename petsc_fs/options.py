@@ -197,6 +197,24 @@ def delete_all(names: Iterable[str]) -> None:
 
 
 @contextlib.contextmanager
+def inserted(values: Path | Mapping[str, str | None], prefix: str = "") -> Iterator[None]:
+    """Have options in PETSc's database within a block; what is set there already stays. Local.
+
+    Args:
+        values: options file, or options by name.
+        prefix: put before each name.
+
+    Raises:
+        UsageError: see `parse`.
+    """
+    new = insert_all(parse(values) if isinstance(values, Path) else values, prefix)
+    try:
+        yield
+    finally:
+        delete_all(new)
+
+
+@contextlib.contextmanager
 def replaced(values: Mapping[str, str | None]) -> Iterator[None]:
     """Have options in PETSc's database within a block, in place of those that are set there. Local.
 

@@ -28,6 +28,15 @@ Mask = NDArray[np.bool_]
 KINDS = ("auto", "rcb", "ptscotch", "contiguous")
 """Values of -petsc_fs_partition."""
 
+ORDERINGS = ("auto", "natural", "morton")
+"""Values of -petsc_fs_ordering."""
+
+CELLS_IN_CACHE = 10_000
+"""Rock cells of a rank from which on their order matters: below, the vectors of a solve stay in the caches."""
+
+MORTON_BITS = 20
+"""Per coordinate: three of them make up a number of 64 bits."""
+
 SAME_PLACE = 1e-9
 """Coordinates that differ by less than this, relative to the extent of the scene, count as equal."""
 
@@ -138,6 +147,11 @@ def primary_field(cells: Mapping[str, int]) -> str:
     return max(in_order(cells), key=lambda f: cells[f])
 
 
+def fit_cache(cells: Mapping[str, int], ranks: int) -> bool:
+    """Whether each of so many ranks has so few cells that their order does not matter."""
+    return cells[primary_field(cells)] <= CELLS_IN_CACHE * ranks
+
+
 def graph_block(dimension: int, cells: Mapping[str, int], cell_dimension: Integers | None) -> str:
     """The field whose diagonal block is the graph of the rock: mass rather than momentum, as it is smaller."""
     primary = primary_field(cells)
@@ -145,27 +159,37 @@ def graph_block(dimension: int, cells: Mapping[str, int], cell_dimension: Intege
     return "mass" if rock is not None and (primary == "mass" or np.count_nonzero(rock) == cells[primary]) else primary
 
 
-def chosen_kind(prefix: str = "") -> str:
-    """Value of -petsc_fs_partition in the options database.
+def chosen(prefix: str = "") -> tuple[str, str]:
+    """Kind of partition and ordering that the options say.
+
+    Options:
+        -petsc_fs_partition auto|rcb|ptscotch|contiguous: which rank gets which cells, see `parts_of`.
+        -petsc_fs_ordering auto|natural|morton: order of the cells of a rank, see `parts_of`.
 
     Raises:
-        UsageError: it is none of `KINDS`.
+        UsageError: a value is none of `KINDS` or `ORDERINGS`.
     """
     from petsc4py import PETSc
 
-    kind = str(PETSc.Options(prefix).getString("petsc_fs_partition", "auto"))
-    if kind not in KINDS:
-        raise UsageError(f"-{prefix}petsc_fs_partition {kind}: expected {' or '.join(KINDS)}")
-    return kind
+    values = []
+    for name, choices in (("petsc_fs_partition", KINDS), ("petsc_fs_ordering", ORDERINGS)):
+        value = str(PETSc.Options(prefix).getString(name, "auto"))
+        if value not in choices:
+            raise UsageError(f"-{prefix}{name} {value}: expected {' or '.join(choices)}")
+        values.append(value)
+    return values[0], values[1]
 
 
-def partition(scene: Scene | None, comm: MPI.Intracomm, kind: str = "auto", prefix: str = "") -> Layout:
+def partition(
+    scene: Scene | None, comm: MPI.Intracomm, kind: str = "auto", ordering: str = "auto", prefix: str = ""
+) -> Layout:
     """The layout of a scene. Collective on `comm`; rank 0 computes, the others receive.
 
     Args:
         scene: the whole scene; only rank 0 looks at it, so others may have None.
         comm: communicator.
         kind: one of `KINDS`.
+        ordering: one of `ORDERINGS`.
         prefix: of the options of the graph partitioner, `-mat_partitioning_...` after it and `petsc_fs_`.
 
     Raises:
@@ -176,7 +200,7 @@ def partition(scene: Scene | None, comm: MPI.Intracomm, kind: str = "auto", pref
         if comm.rank == 0:
             if scene is None:
                 raise SceneError("partition: rank 0 has no scene")
-            parts = parts_of(Places.of(scene), comm.size, kind, prefix)
+            parts = parts_of(Places.of(scene), comm.size, kind, ordering, prefix)
             dimension = scene.dimension
     return layout_of(parts, comm, dimension if comm.rank == 0 else 0)
 
@@ -187,8 +211,10 @@ def layout_of(parts: Parts | None, comm: MPI.Intracomm, dimension: int) -> Layou
     return Layout.from_owners(comm, dimension, owners, order)
 
 
-def parts_of(places: Places, ranks: int, kind: str = "auto", prefix: str = "") -> Parts:
-    """Cut the cells of a scene into as many parts as there are ranks. Local.
+def parts_of(places: Places, ranks: int, kind: str = "auto", ordering: str = "auto", prefix: str = "") -> Parts:
+    """Cut the cells of a scene into as many parts as there are ranks, and order those of each part. Local.
+
+    Kinds:
 
     - rcb: recursive coordinate bisection of the rock cells, weighted by the unknowns they anchor;
     - ptscotch: their graph, all vertices alike, by PETSc's MatPartitioning (`-petsc_fs_mat_partitioning_type` takes
@@ -196,20 +222,35 @@ def parts_of(places: Places, ranks: int, kind: str = "auto", prefix: str = "") -
     - contiguous: each field in the order of the scene, in chunks of equal length, nothing together;
     - auto: rcb where cell centres are known, else ptscotch where PETSc has it, else contiguous.
 
-    On one rank nothing is moved, and within a rank cells keep the order of the scene: with some hundred entries a row,
-    products run at the speed of memory and iterations stay the same whether cells are ordered by bisection, by reverse
-    Cuthill-McKee or at random.
+    Orderings:
+
+    - natural: that of the scene;
+    - morton: along a space-filling curve, see `morton`, so that neighbours stand near each other in memory. Grid
+      generators number them almost at random, and then each entry of a matrix with few in a row, as in multigrid for
+      single components, may wait for memory. With bisection and reverse Cuthill-McKee gains are the same;
+    - auto: morton where cell centres are known and a rank has more than `CELLS_IN_CACHE` rock cells, else natural.
+
+    Contiguous chunks are left as they are.
 
     Raises:
-        UsageError: the scene or this PETSc lacks what the kind needs.
+        UsageError: the scene or this PETSc lacks what kind or ordering needs.
     """
     primary = primary_field(places.cells)
-    if kind == "auto":
-        if primary in places.centers:
+    centers = places.centers.get(primary)
+    if kind == "auto" and ranks > 1:
+        if centers is not None:
             kind = "rcb"
         else:
             kind = "ptscotch" if has_partitioner("ptscotch") else "contiguous"
-    if kind == "contiguous" or ranks == 1:
+    if ordering == "morton" and centers is None:
+        raise UsageError(f"-{prefix}petsc_fs_ordering morton: no cell_centers of {primary} in the scene; use natural")
+    if ordering == "morton" and kind == "contiguous":
+        raise UsageError(
+            f"-{prefix}petsc_fs_ordering morton: -{prefix}petsc_fs_partition contiguous keeps the scene's; use rcb"
+        )
+    if ordering == "auto":
+        ordering = "natural" if centers is None or fit_cache(places.cells, ranks) else "morton"
+    if kind == "contiguous" or (ranks == 1 and ordering == "natural"):
         chunks = {f: np.arange(1, ranks + 1) * n // ranks for f, n in places.cells.items()}
         owners = {f: np.searchsorted(c, np.arange(places.cells[f]), side="right") for f, c in chunks.items()}
         return Parts(owners, {f: np.arange(n) for f, n in places.cells.items()})
@@ -219,17 +260,38 @@ def parts_of(places: Places, ranks: int, kind: str = "auto", prefix: str = "") -
         weights += np.bincount(a, minlength=weights.size) * FIELD[f].block_size(places.dimension)
     members = np.flatnonzero(anchor[primary] == np.arange(weights.size))
     part = np.zeros(weights.size, dtype=np.int64)
-    order = np.arange(weights.size)
-    if kind == "rcb":
-        if primary not in places.centers:
+    if ranks > 1 and kind == "rcb":
+        if centers is None:
             raise UsageError(
                 f"-{prefix}petsc_fs_partition rcb: no cell_centers of {primary} in the scene; use ptscotch"
             )
-        part[members] = bisect(places.centers[primary][members], weights[members], ranks)
-    else:
+        part[members] = bisect(centers[members], weights[members], ranks)
+    elif ranks > 1:
         name, cells, part_of = _graph_parts(places, ranks, prefix)
         part[anchor[name][cells]] = part_of
+    order = morton(centers) if ordering == "morton" and centers is not None else np.arange(weights.size)
     return Parts({f: part[a] for f, a in anchor.items()}, {f: order[a] for f, a in anchor.items()})
+
+
+def morton(points: Floats) -> Integers:
+    """Places along the curve of Morton, "A computer oriented geodetic data base" (IBM, 1966), which fills space.
+
+    Args:
+        points: (n, 3).
+
+    Returns:
+        (n,) the bits of the three coordinates by turns, the highest first; points nearer to each other than 1e-6 of
+        their extent may share a number.
+    """
+    if not len(points):
+        return np.zeros(0, dtype=np.int64)
+    extent = float(np.ptp(points, axis=0).max()) or 1.0
+    steps = ((points - points.min(axis=0)) / extent * (2**MORTON_BITS - 1)).astype(np.int64)
+    key = np.zeros(len(points), dtype=np.int64)
+    for bit in range(MORTON_BITS):
+        for axis in range(3):
+            key |= ((steps[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return key
 
 
 def bisect(points: Floats, weights: Floats, parts: int) -> Integers:

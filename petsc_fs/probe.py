@@ -141,13 +141,13 @@ class Probe:
 
         from petsc_fs import options
         from petsc_fs.distributed_reader import read_distributed
-        from petsc_fs.partition import chosen_kind
+        from petsc_fs.partition import chosen
 
         with together(self.comm):
             self.given = self._options()
         self.comm.Barrier()
         started, cpu = MPI.Wtime(), time.process_time()
-        self.scene, self.layout = read_distributed(self.path, self.comm, chosen_kind(), index_type=PETSc.IntType)
+        self.scene, self.layout = read_distributed(self.path, self.comm, *chosen(), index_type=PETSc.IntType)
         self.read_seconds = self._slowest(MPI.Wtime() - started)
         self.read_cpu = self._slowest(time.process_time() - cpu)
         if self.job.options_file is None:
@@ -371,7 +371,7 @@ class Judge:
 
     def errors(self, solution: dict[str, Any], backward: bool = True) -> Record:
         """Forward errors where there is a reference, and backward errors if asked for."""
-        from petsc_fs.accuracy import backward_error
+        from petsc_fs.accuracy import backward_error, residual, row_magnitudes
         from petsc_fs.conditioning import fieldwise_backward_error
 
         found: Record = {}
@@ -379,8 +379,9 @@ class Judge:
             errors = self.ruler.errors(solution)
             found |= {"forward_error": errors.total, "error_by_field": errors.by_field}
         if backward:
-            fieldwise = {"fieldwise": fieldwise_backward_error(self.scene, solution)}
-            found["backward_error"] = backward_error(self.scene, solution) | fieldwise
+            known = (solution, residual(self.scene, solution), row_magnitudes(self.scene, solution))
+            fieldwise = {"fieldwise": fieldwise_backward_error(self.scene, *known)}
+            found["backward_error"] = backward_error(self.scene, *known) | fieldwise
         return found
 
 

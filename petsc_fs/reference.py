@@ -32,6 +32,7 @@ from petsc_fs import hdf5
 from petsc_fs.accuracy import Ruler, backward_error
 from petsc_fs.errors import PetscFsError, SceneError, SolveError
 from petsc_fs.files import complete
+from petsc_fs.options import inserted
 from petsc_fs.scene import CSR, Scene
 
 Floats = NDArray[np.float64]
@@ -295,7 +296,7 @@ def _direct(scene: Scene, matrix: CSR) -> Iterator[tuple[Solve, str]]:
         return np.asarray(c * x.getArray())
 
     try:
-        with database(WORKSPACE if package == "mumps" else {}):
+        with inserted(WORKSPACE if package == "mumps" else {}, PREFIX):
             pc.setFromOptions()
             pc.setUp()
         yield correct, f"LU ({package}) of the equilibrated matrix"
@@ -315,7 +316,7 @@ def _iterative(scene: Scene, matrix: CSR) -> Iterator[tuple[Solve, str]]:
     from petsc_fs.solver import Solver
 
     tolerances = {"ksp_rtol": str(INNER_RTOL), "ksp_atol": "0", "petsc_fs_restarts": "0", "ksp_max_it": "500"}
-    with database({**tree_for(scene, MPI.COMM_SELF).options, **tolerances}):
+    with inserted({**tree_for(scene, MPI.COMM_SELF).options, **tolerances}, PREFIX):
         solver = Solver(scene, MPI.COMM_SELF, prefix=PREFIX)
 
         def correct(residual: Floats) -> Floats:
@@ -328,18 +329,6 @@ def _iterative(scene: Scene, matrix: CSR) -> Iterator[tuple[Solve, str]]:
             yield correct, f"the field-split Krylov method to {INNER_RTOL:g}"
         finally:
             solver.destroy()
-
-
-@contextmanager
-def database(values: Mapping[str, str | None]) -> Iterator[None]:
-    """Options under `PREFIX` for the time of a block; the user's own win."""
-    from petsc_fs import options
-
-    added = options.insert_all(values, PREFIX)
-    try:
-        yield
-    finally:
-        options.delete_all(added)
 
 
 def digest(path: str | os.PathLike[str]) -> str:

@@ -16,7 +16,7 @@ from petsc_fs.errors import PetscFsError, UsageError, together
 from petsc_fs.files import write_text
 from petsc_fs.layout import Layout
 from petsc_fs.pattern import UnionPattern
-from petsc_fs.tree import Facts, Tree, canonical_name, smallest_tree
+from petsc_fs.tree import Facts, Tree, shipped_tree
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -128,7 +128,7 @@ class Player:
         from petsc4py import PETSc
 
         from petsc_fs.distributed_reader import read_distributed
-        from petsc_fs.partition import chosen_kind
+        from petsc_fs.partition import chosen
 
         layout = self._layout
         if layout is not None and {f: layout.sizes(f)[1] for f in layout.fields} != step.sizes:
@@ -136,7 +136,7 @@ class Player:
         scene, self._layout = read_distributed(
             self.path,
             self.comm,
-            chosen_kind(),
+            *chosen(),
             layout=layout,
             index_type=PETSc.IntType,
             find=lambda file: sequence.find_step(file, step.index),
@@ -194,7 +194,7 @@ class Player:
             return
         self._forget_solver()
         options.delete_all(self._inserted)
-        self.tree = smallest_tree(options.parse(options.find_options_file(canonical_name())), facts)
+        self.tree = shipped_tree(facts)
         self._inserted = options.insert_all(self.tree.options)
         self._facts = facts
 

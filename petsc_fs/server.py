@@ -339,11 +339,11 @@ class _Rank:
                 database.setValue(name, value)
 
     def make_layout(self, handle: int, prefix: str, scene: Scene | None = None) -> Layout:
-        """Decide by -petsc_fs_partition which rank gets what; rank 0 has the scene."""
-        from petsc_fs.partition import chosen_kind, partition
+        """Decide by -petsc_fs_partition and -petsc_fs_ordering which rank gets what; rank 0 has the scene."""
+        from petsc_fs.partition import chosen, partition
 
         self.drop(handle)
-        layout = partition(scene, self.comm, chosen_kind(prefix), prefix)
+        layout = partition(scene, self.comm, *chosen(prefix), prefix)
         self._kept[handle] = _Kept(prefix, layout)
         return layout
 

@@ -26,7 +26,7 @@ from petsc_fs.fields import MECHANICS
 from petsc_fs.judgement import EPS, ERROR_FACTOR, Criteria, Result, apply_preconditioner, judge
 from petsc_fs.layout import Layout
 from petsc_fs.levels import levels
-from petsc_fs.partition import chosen_kind, partition
+from petsc_fs.partition import chosen, partition
 from petsc_fs.petsc_errors import brief, translate
 from petsc_fs.regularization import lift
 from petsc_fs.reuse import Reuse
@@ -71,6 +71,7 @@ class Solver:
         -petsc_fs_mat_type nest|merged|aij: storage of the Jacobian; aij copies the blocks into one matrix,
             merged only those of mechanics, where ContactTransform does not.
         -petsc_fs_partition auto|rcb|ptscotch|contiguous: which rank gets which cells, see `petsc_fs.partition`.
+        -petsc_fs_ordering auto|natural|morton: order of the cells of a rank, see there too.
         -petsc_fs_restarts n: how often the Krylov method may start again from its own solution where the
             true residual misses the tolerance that its recursive estimate has met; default 2.
         -petsc_fs_true_rtol r: relative true residual that counts as converged; default -ksp_rtol.
@@ -110,7 +111,8 @@ class Solver:
         Args:
             scene: all rows on every rank, or the rows of this rank as `layout` has them.
             comm: communicator, default MPI_COMM_WORLD.
-            layout: distribution of rows; default by -petsc_fs_partition where the scene is whole, else contiguous.
+            layout: distribution of rows; default by -petsc_fs_partition and -petsc_fs_ordering where several ranks
+                have the whole scene, else the scene's order in chunks.
             prefix: of all options of this solver, including its own.
             release: empty `scene.blocks` while PETSc's matrices are made, for callers that have no other use
                 for them: matrix and scene are then not both in memory.
@@ -172,11 +174,11 @@ class Solver:
         return part if part.rows is not None else part.restrict(self.layout)
 
     def _layout_of(self, scene: Scene, comm: MPI.Intracomm) -> Layout:
-        """By -petsc_fs_partition, where every rank has the whole scene; parts are taken for contiguous ones."""
-        kind = chosen_kind(self.prefix)
+        """By the options where several ranks have the whole scene each; else the scene's order, cut into chunks."""
+        kind, ordering = chosen(self.prefix)
         whole = comm.allreduce(scene.rows is None, MPI.LAND)
         if whole and comm.size > 1:
-            return partition(scene, comm, kind, self.prefix)
+            return partition(scene, comm, kind, ordering, self.prefix)
         return Layout.contiguous(comm, scene.dimension, scene.sizes)
 
     def _create_ksp(self, system: System) -> PETSc.KSP:
@@ -237,7 +239,7 @@ class Solver:
         Collective. PETSc's objects are kept where the nonzero pattern allows it, else made anew.
         """
         started = time.perf_counter()
-        scales = self.system.row_scale
+        scales = self.system.row_scale if self.system.is_scaled else None
         with together(self.layout.comm):
             self.scene = self._part(scene)
         renew = self.fallback.take_matrix(self.ksp, self._solved)
@@ -252,7 +254,7 @@ class Solver:
             if renew:
                 self._renew_preconditioner()
                 self.reuse.release()
-        if any(scale != 1.0 for scale in scales.values()):
+        if scales is not None:
             self.system.scale_rows(scales)
         self.reuse.take_matrix(self.scene.contact_state, self.layout.comm, self._mechanics_scale())
         self.scene.blocks.clear()
@@ -410,7 +412,7 @@ class Solver:
             aim = min(result.error_tolerance, DOUBTFUL * wanted)
             tighter = max(0.1 * wanted * min(1.0, aim / worst), EPS)
             self.ksp.setTolerances(rtol=tighter, atol=0.0)
-        elif not scaled and any(scale != 1.0 for scale in self.system.row_scale.values()):
+        elif not scaled and self.system.is_scaled:
             # small in the norm of the scaled rows alone
             missing = 0.1 * result.tolerance / result.true_relative_residual
             atol = self.ksp.getTolerances()[1]

@@ -99,17 +99,22 @@ HELD_OUT: dict[str, Recipe] = {f"held_out_model_{k:02}": _draw_model(k) for k in
 
 def transform(scene: Scene, number: int) -> Scene:
     """A scene with two or three random changes."""
-    random = np.random.default_rng([SEED, 1000 + number])
-    chosen = random.permutation(list(CHANGES))[: int(random.integers(2, 4))]
-    for name in chosen:
-        scene = CHANGES[str(name)](scene, random)
+    names, random = _chosen(number)
+    for name in names:
+        scene = CHANGES[name](scene, random)
     return scene
 
 
 def changes(number: int) -> list[str]:
     """What `transform` does, in words."""
+    return _chosen(number)[0]
+
+
+def _chosen(number: int) -> tuple[list[str], np.random.Generator]:
+    """The changes of a case by name, and the random numbers to make them with."""
     random = np.random.default_rng([SEED, 1000 + number])
-    return [str(name) for name in random.permutation(list(CHANGES))[: int(random.integers(2, 4))]]
+    shuffled = random.permutation(list(CHANGES)).tolist()
+    return shuffled[: int(random.integers(2, 4))], random
 
 
 def _units(scene: Scene, random: np.random.Generator) -> Scene:

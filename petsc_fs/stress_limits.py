@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from petsc_fs.files import write_text
+from petsc_fs.markdown import table
 from petsc_fs.stress_cases import RECIPES
-from petsc_fs.stress_page import RARE, order, paragraph, table
+from petsc_fs.stress_page import RARE, order, paragraph
 
 
 @dataclass(frozen=True)

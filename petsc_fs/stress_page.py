@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import textwrap
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from petsc_fs.files import complete, write_text
+from petsc_fs.markdown import table
 from petsc_fs.plot import pyplot
 from petsc_fs.stress import (
     OUTCOMES,
@@ -83,15 +84,6 @@ def write_page(found: Found, target: Path) -> list[Path]:
     ]
     write_text(target, "\n".join(lines) + "\n")
     return [target, picture]
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
-    """Lines of a table."""
-    return [
-        "| " + " | ".join(head) + " |",
-        "| --- " * len(head) + "|",
-        *("| " + " | ".join(map(str, row)) + " |" for row in rows),
-    ]
 
 
 def paragraph(text: str) -> list[str]:

@@ -9,12 +9,13 @@ import shutil
 import subprocess
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from petsc_fs import measure
 from petsc_fs.files import complete, write_text
+from petsc_fs.markdown import table
 from petsc_fs.plot import pyplot
 from petsc_fs.space import ABSENT
 from petsc_fs.sweep import OBJECTIVES, OUTCOMES, STARTUP_TRIALS
@@ -163,7 +164,7 @@ def _best(results: Results, lint: str) -> Iterator[str]:
     yield ""
     if results["changes"]:
         rows = [[f"`-{n}`", _value(old), _value(new)] for n, (old, new) in results["changes"].items()]
-        yield from _table(["option", results["base"], "best.opts"], rows)
+        yield from table(["option", results["base"], "best.opts"], rows, compact=True)
     else:
         yield "It is the base file: no trial was better."
     yield ""
@@ -228,7 +229,7 @@ def _comparison(found: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
                 _error(s["error"]),
             ]
         )
-    yield from _table(heads, rows)
+    yield from table(heads, rows, compact=True)
     ratios = [s["ratios"]["time"] for s in found.values() if s["outcome"] == "solved"]
     if len(ratios) > 1:
         from petsc_fs.sweep import aggregate
@@ -248,7 +249,7 @@ def _outcomes(results: Results) -> Iterator[str]:
     for kind, count in sorted(results["outcomes"].items(), key=lambda item: -item[1]):
         message = next((t["message"] for t in results["trials"] if t["outcome"] == kind), "")
         rows.append([kind, str(count), OUTCOMES[kind], _escaped(message)])
-    yield from _table(["outcome", "trials", "meaning", "for example"], rows)
+    yield from table(["outcome", "trials", "meaning", "for example"], rows, compact=True)
     repeated = sum(t["same_as"] is not None for t in results["trials"])
     if repeated:
         yield ""
@@ -278,7 +279,7 @@ def _front(results: Results, picture: str) -> Iterator[str]:
         totals = [f"{t['totals'][o][how]:.2f}" for o in OBJECTIVES for how in _hows(results)]
         values = [f"{name} {_short(t['values'][name])}" for name in shown if name in t["values"]]
         rows.append([str(number), *totals, ", ".join(values)])
-    yield from _table(heads, rows)
+    yield from table(heads, rows, compact=True)
 
 
 def _hows(results: Results) -> tuple[str, ...]:
@@ -306,14 +307,7 @@ def _importance(results: Results) -> Iterator[str]:
         [f"`{p}`", *(f"{results['importance'][name][o].get(p, 0.0):.2f}" for name, o in columns)]
         for p in sorted(first, key=lambda p: -first[p])
     ]
-    yield from _table(["parameter", *(f"{o} ({name})" for name, o in columns)], rows)
-
-
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    yield f"| {' | '.join(heads)} |"
-    yield f"|{'---|' * len(heads)}"
-    for row in rows:
-        yield f"| {' | '.join(row)} |"
+    yield from table(["parameter", *(f"{o} ({name})" for name, o in columns)], rows, compact=True)
 
 
 def plot(results: Results, target: Path) -> None:

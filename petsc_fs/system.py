@@ -171,6 +171,11 @@ class System:
         """Set the right-hand side from the local rows of each field."""
         self.b.setArray(np.concatenate([self.row_scale[f] * rhs[f] for f in self.layout.fields]))
 
+    @property
+    def is_scaled(self) -> bool:
+        """Whether the rows of any field are scaled."""
+        return any(scale != 1.0 for scale in self.row_scale.values())
+
     def by_field(self, vector: PETSc.Vec) -> FieldArrays:
         """The local rows of each field of a vector, copied."""
         bounds = np.cumsum([self.layout.sizes(f)[0] for f in self.layout.fields])[:-1]

@@ -15,6 +15,7 @@ import numpy as np
 from petsc_fs.errors import UsageError, together
 from petsc_fs.fields import FIELD_NAMES, MECHANICS
 from petsc_fs.fixed_stress import analytic_coefficients
+from petsc_fs.options import find_options_file, parse
 from petsc_fs.scene import Scene
 
 if TYPE_CHECKING:
@@ -35,6 +36,11 @@ def canonical_name() -> str:
     from petsc4py import PETSc
 
     return CANONICAL if PETSc.Sys.hasExternalPackage("hypre") else WITHOUT_HYPRE
+
+
+def canonical_options() -> Options:
+    """Options of the file with all levels that this PETSc can run, by full name."""
+    return parse(find_options_file(canonical_name()))
 
 
 @dataclass(frozen=True)
@@ -219,6 +225,11 @@ def smallest_tree(canonical: Mapping[str, str | None], facts: Facts) -> Tree:
     elif len(facts.mechanics) > 1:
         outer["petsc_fs_mat_type"] = "merged"
     return Tree({**outer, **node}, tuple(_left_out(facts)))
+
+
+def shipped_tree(facts: Facts) -> Tree:
+    """The smallest tree cut from the shipped canonical file; see `smallest_tree`."""
+    return smallest_tree(canonical_options(), facts)
 
 
 STRESS_OPTIONS = ("fs_type", "fs_damping")

@@ -8,8 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from sample import SCENES
 
-from petsc_fs import bench, bench_page, bench_probe
+from petsc_fs import bench, bench_page, bench_probe, options
 from petsc_fs.bench import Benchmark, Row, Settings
 from petsc_fs.errors import SolveError, UsageError
 
@@ -184,6 +185,20 @@ def test_options_after_a_file_make_another_entry():
     )
 
 
+def test_each_file_has_its_own_order_of_cells():
+    from mpi4py import MPI
+
+    kept = bench_probe.Kept(SCENES / "model1.h5", MPI.COMM_SELF)
+    assert not kept.layout.cells
+    natural = kept.scenes[0]
+    with options.inserted({"petsc_fs_ordering": "morton"}):
+        kept.distribute()
+        assert "momentum" in kept.layout.cells
+        assert kept.scenes[0].rhs["momentum"].sum() == pytest.approx(natural.rhs["momentum"].sum())
+    kept.distribute()
+    assert kept.scenes[0] is natural
+
+
 def test_nothing_solved_is_an_error(monkeypatch):
     failure = [{"kind": "failed", "file": None, "message": "no machine"}]
     monkeypatch.setattr(bench, "measure", lambda *_: failure)
@@ -208,7 +223,7 @@ def test_a_scene_and_a_sequence_are_measured(tmp_path):
     done = call("model2.h5", "model2_run.h5", "--options", FAST, "--repeat", "2", "--out", str(tmp_path / "found"))
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "found.json").read_text())["rows"]
-    files = ["contact_poromechanics", "contact_poromechanics_fast"]
+    files = ["contact_poromechanics, ordering natural", "contact_poromechanics_fast"]
     assert [(r["input"], r["file"]) for r in rows] == [(i, f) for i in ("model2", "model2_run") for f in files]
     assert all(r["converged"] and not r["outcome"] for r in rows)
     assert rows[0]["ratio"] == 1.0

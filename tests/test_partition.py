@@ -12,6 +12,7 @@ from mpi4py import MPI
 from sample import CELLS, SCENES, full_scene
 
 from petsc_fs import hdf5, options
+from petsc_fs.distributed_reader import read_distributed
 from petsc_fs.errors import LayoutError, SceneError, UsageError
 from petsc_fs.fields import FIELD
 from petsc_fs.layout import Layout, rows_of
@@ -21,9 +22,10 @@ from petsc_fs.partition import (
     Places,
     anchors,
     bisect,
-    chosen_kind,
+    chosen,
     has_partitioner,
     match,
+    morton,
     partition,
     parts_of,
 )
@@ -198,13 +200,48 @@ def test_points_find_those_at_the_same_place():
 def test_what_is_missing_is_named(database):
     scene = without_centers(load("biot"))
     with pytest.raises(UsageError, match=r"-x_petsc_fs_partition rcb: no cell_centers of momentum in the scene; use"):
-        parts_of(Places.of(scene), 2, "rcb", "x_")
+        parts_of(Places.of(scene), 2, "rcb", prefix="x_")
+    with pytest.raises(UsageError, match=r"-x_petsc_fs_ordering morton: no cell_centers of momentum in the scene; use"):
+        parts_of(Places.of(scene), 1, ordering="morton", prefix="x_")
+    with pytest.raises(UsageError, match="-petsc_fs_ordering morton: -petsc_fs_partition contiguous keeps the scene's"):
+        parts_of(Places.of(load("biot")), 2, "contiguous", "morton")
     database("direct.opts", petsc_fs_mat_partitioning_type="nothing")
     with pytest.raises(UsageError, match="this PETSc has no such partitioner"):
         parts_of(Places.of(scene), 2, "ptscotch")
+    database("direct.opts", petsc_fs_ordering="rcm")
+    with pytest.raises(UsageError, match="-petsc_fs_ordering rcm: expected auto or natural or morton"):
+        chosen()
     database("direct.opts", petsc_fs_partition="metis")
     with pytest.raises(UsageError, match="-petsc_fs_partition metis: expected auto or rcb or ptscotch or contiguous"):
-        chosen_kind()
+        chosen()
+
+
+def test_the_curve_visits_each_octant_in_turn():
+    corners = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
+    np.testing.assert_array_equal(np.argsort(morton(corners)), np.argsort(corners @ [1, 2, 4]))
+    points = np.random.default_rng(3).random((4096, 3))
+    along = points[np.argsort(morton(points))]
+    octant = (along > 0.5) @ [1, 2, 4]
+    assert np.count_nonzero(np.diff(octant)) == 7
+    step = np.linalg.norm(np.diff(along, axis=0), axis=1)
+    assert step.mean() < 0.2 * np.linalg.norm(np.diff(points, axis=0), axis=1).mean()
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 3)), np.ones((5, 3))], ids=["none", "one place"])
+def test_the_curve_has_a_place_for_all(points):
+    np.testing.assert_array_equal(morton(points), np.zeros(len(points)))
+
+
+@pytest.mark.parametrize("ranks", [1, 3])
+def test_cells_are_ordered_where_there_are_many(ranks, monkeypatch):
+    places = Places.of(load("model3"))
+    natural = parts_of(places, ranks)
+    np.testing.assert_array_equal(natural.order["momentum"], np.arange(places.cells["momentum"]))
+    monkeypatch.setattr("petsc_fs.partition.CELLS_IN_CACHE", places.cells["momentum"] // ranks - 1)
+    ordered = parts_of(places, ranks)
+    np.testing.assert_array_equal(ordered.order["momentum"], morton(places.centers["momentum"]))
+    for f in places.cells:
+        np.testing.assert_array_equal(natural.owners[f], ordered.owners[f])
 
 
 # --- layout
@@ -253,6 +290,22 @@ def test_solutions_come_back_in_the_order_of_the_scene(database, kind):
     for f in scene.fields if found is not None else ():
         assert np.linalg.norm(found[f] - expected[f]) < 1e-6 * np.linalg.norm(expected[f])
         np.testing.assert_allclose(again[f], found[f], rtol=1e-6, atol=1e-9 * np.abs(found[f]).max())
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("name", ["model3", "flow"])
+def test_the_order_of_cells_changes_no_solution(name, database):
+    database("direct.opts")
+    found = {}
+    for ordering in ("natural", "morton"):
+        scene, layout = read_distributed(SCENES / f"{name}.h5", comm, ordering=ordering)
+        assert bool(layout.cells) == (ordering == "morton" or comm.size > 1)
+        solver = Solver(scene, layout=layout)
+        parts = comm.allgather(solver.solve().solution)
+        solver.destroy()
+        found[ordering] = {f: layout.to_scene(f, np.concatenate([p[f] for p in parts])) for f in layout.fields}
+    for f, expected in found["natural"].items():
+        np.testing.assert_allclose(found["morton"][f], expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
 
 
 @pytest.mark.mpi

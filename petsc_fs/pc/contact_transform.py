@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from petsc4py import PETSc
 
+from petsc_fs.diagnostics import REMEDY
 from petsc_fs.dm import Blocks, Members, Problem, field_dm, field_nest, merge_mechanics
 from petsc_fs.errors import LayoutError, SceneError, UsageError, together
 from petsc_fs.fields import MECHANICS, in_order
@@ -92,7 +93,8 @@ class ContactTransform(WrapperPC):
             self._source, self._target = self._transform.createVecs()
         for pair, (left, right) in changed.items():
             S[pair] = add_product(J.get(pair), left, right)
-        C_inverse = block_diagonal_inverse(S["contact", "contact"], "J~_11, block of contact", problem)
+        lifted = self.side != "none"  # -petsc_fs_regularize leaves J_11 itself alone
+        C_inverse = block_diagonal_inverse(S["contact", "contact"], "J~_11, block of contact", problem, lifted=lifted)
         rows = [r for r in others if r != "contact" and (r, "contact") in S]
         columns = [c for c in others if c != "contact" and ("contact", c) in S]
         for c in columns:
@@ -174,10 +176,16 @@ def add_product(M: PETSc.Mat | None, A: PETSc.Mat, B: PETSc.Mat) -> PETSc.Mat:
     return X
 
 
-def block_diagonal_inverse(A: PETSc.Mat, what: str, problem: Problem) -> PETSc.Mat:
+def block_diagonal_inverse(A: PETSc.Mat, what: str, problem: Problem, *, lifted: bool = True) -> PETSc.Mat:
     """AIJ with the inverses of the diagonal blocks of a square matrix, block by block.
 
     Collective.
+
+    Args:
+        A: with blocks as large as the dimension.
+        what: its name, the field last.
+        problem: with what is known of cells.
+        lifted: whether -petsc_fs_regularize lifts weak blocks of it.
 
     Raises:
         LayoutError: the block size was lost on the way.
@@ -201,6 +209,7 @@ def block_diagonal_inverse(A: PETSc.Mat, what: str, problem: Problem) -> PETSc.M
                 f"{what}: singular at cell {problem.layout.scene_cell(name, first // D + cell)}{state}"
                 + (f", and at {bad.size - 1} more on this rank" if bad.size > 1 else "")
                 + "; the contact unknowns cannot be eliminated"
+                + (f" unless -petsc_fs_regularize (try {REMEDY:g}) lifts it for the preconditioner" if lifted else "")
             )
     inverse = np.linalg.inv(dense)
     columns = first + (np.arange(cells) * D)[:, None, None] + np.zeros((D, 1), dtype=np.int64) + np.arange(D)

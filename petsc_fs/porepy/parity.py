@@ -20,6 +20,7 @@ import numpy as np
 
 from petsc_fs.errors import UsageError
 from petsc_fs.files import write_text
+from petsc_fs.options import inserted
 from petsc_fs.porepy.cases import ModelParameters
 from petsc_fs.scene import CONTACT_STATES
 
@@ -168,7 +169,7 @@ def measure(
     from petsc_fs.porepy.lean_model import LeanModel
     from petsc_fs.porepy.models import StopRun, make_model
     from petsc_fs.porepy.models import run as run_model
-    from petsc_fs.porepy.solver import FieldSplitSolver, inserted
+    from petsc_fs.porepy.solver import FieldSplitSolver
 
     mixins = (FieldSplitSolver, LeanModel) if this.lean else (FieldSplitSolver,)
     model = make_model(this.model, this.parameters, mixins=mixins)

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from petsc_fs import markdown
 from petsc_fs.porepy.cases import CASES
 from petsc_fs.porepy.parity import (
     RUNS,
@@ -217,5 +218,4 @@ def versions_text(found: Mapping[str, str]) -> str:
 
 def table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table; the first column is text, the others are numbers."""
-    rule = ["---", *["--:"] * (len(headings) - 1)]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in [headings, rule, *rows])
+    return "\n".join(markdown.table(headings, rows, numbers=True))

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petsc_fs.errors import UsageError
+from petsc_fs.options import inserted
 from petsc_fs.porepy.parity import (
     AS_PUBLISHED,
     Keep,
@@ -34,7 +35,7 @@ from petsc_fs.porepy.parity import (
     line,
     versions,
 )
-from petsc_fs.porepy.solver import FieldSplitSolver, inserted
+from petsc_fs.porepy.solver import FieldSplitSolver
 
 PREFIX = "petsc_fs_again_"
 """Of the options of the second solve: the published code clears all options before each of its own."""

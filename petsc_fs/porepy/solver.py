@@ -16,8 +16,7 @@ import logging
 import math
 import sys
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,7 +31,7 @@ from petsc_fs.forcing import EisenstatWalker, EisenstatWalkerParameters
 from petsc_fs.memory import return_freed
 from petsc_fs.pattern import UnionPattern
 from petsc_fs.scene import Scene, contact_state_counts
-from petsc_fs.tree import Facts, Tree, canonical_name, smallest_tree
+from petsc_fs.tree import Facts, Tree, shipped_tree
 
 if TYPE_CHECKING:
     from petsc_fs.porepy.adapter import Adapter
@@ -205,7 +204,7 @@ class FieldSplitSolver:
         scene = self._adapter.scene()
         cut_seconds = time.perf_counter() - started
         chosen = self._choose(scene)
-        with inserted(chosen.values, self._options_prefix):
+        with options.inserted(chosen.values, self._options_prefix):
             residual = self._nonlinear_residual(scene)
             outcome = self._solve_by_policy(scene, self._forcing_term(residual))
             if not self.linear_solves:
@@ -269,7 +268,7 @@ class FieldSplitSolver:
             facts = facts.or_either(self._facts)
         if self._chosen is None or facts != self._facts:
             self._forget_solver()
-            tree = smallest_tree(options.parse(options.find_options_file(canonical_name())), facts)
+            tree = shipped_tree(facts)
             self._chosen, self._facts = _Chosen(tree.options, tree=tree), facts
         return self._chosen
 
@@ -360,7 +359,7 @@ class FieldSplitSolver:
         prefix = f"{self._options_prefix}{RETRY}"
         name = PETSc.Options(self._options_prefix).getString("petsc_fs_retry_file", RETRY_FILE)
         file = _fitting_file(name, scene)
-        with inserted(file, prefix):
+        with options.inserted(file, prefix):
             solver = self._create_solver(scene, prefix)
             try:
                 second = _outcome(solver, solver.solve(rtol))
@@ -438,23 +437,3 @@ def _fitting_file(name: str, scene: Scene) -> Path:
             f"this one has {', '.join(in_order(scene.fields))}"
         )
     return header.path
-
-
-@contextmanager
-def inserted(values: Path | Mapping[str, str | None], prefix: str = "") -> Iterator[None]:
-    """Have options in PETSc's database within a block; what is set there already stays.
-
-    Local.
-
-    Args:
-        values: options file, or options by name.
-        prefix: put before each name.
-
-    Raises:
-        UsageError: the file cannot be read.
-    """
-    new = options.insert_all(options.parse(values) if isinstance(values, Path) else values, prefix)
-    try:
-        yield
-    finally:
-        options.delete_all(new)
