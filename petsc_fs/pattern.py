@@ -6,24 +6,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from petsc_fs.scene import CSR, Integers, Scene
+from petsc_fs.scene import CSR, Integers, Scene, gather_rows
+from petsc_fs.splice import Mask, Splice, changed_rows
 
 
 @dataclass
 class _Block:
-    """Pattern of one block: the union, and where the entries of the latest scene stand in it.
+    """Pattern of one block: the union, and which of its entries the latest scene has.
 
     Attributes:
         indptr: of the union.
         indices: of the union.
-        latest: pattern of the latest scene.
-        places: of its entries among those of the union; None if it is the union.
+        latest: `indptr` and `indices` of the latest scene.
+        present: (entries of the union,) whether the latest scene has them; None if it has all.
     """
 
     indptr: Integers
     indices: Integers
-    latest: CSR
-    places: Integers | None = None
+    latest: tuple[Integers, Integers]
+    present: Mask | None = None
 
 
 class UnionPattern:
@@ -43,7 +44,8 @@ class UnionPattern:
     def fit(self, scene: Scene) -> Scene:
         """The scene with the union of the patterns so far.
 
-        Local. Blocks whose pattern is the union already are passed on, not copied.
+        Local. Blocks whose pattern is the union already are passed on, not copied. Where a union has not grown,
+        `indptr` and `indices` are those of the scene before.
 
         Args:
             scene: whole, or always the same rows of it; with the sizes of the scenes before.
@@ -59,36 +61,36 @@ class UnionPattern:
         known = self._blocks.get(rc)
         if known is None:
             self.grew = True
-            self._blocks[rc] = _Block(block.indptr, block.indices, block)
+            self._blocks[rc] = _Block(block.indptr, block.indices, (block.indptr, block.indices))
             return block
-        if not _same_pattern(block, known.latest):
-            self._compare(known, block, columns)
-        if known.places is None:
+        changed = changed_rows(*known.latest, block.indptr, block.indices)
+        if changed.any():
+            self._take_rows(known, block, changed, columns)
+        known.latest = block.indptr, block.indices
+        if known.present is None:
             return CSR(known.indptr, known.indices, block.data)
         data = np.zeros(known.indices.size)
-        data[known.places] = block.data
+        data[known.present] = block.data
         return CSR(known.indptr, known.indices, data)
 
-    def _compare(self, known: _Block, block: CSR, columns: int) -> None:
-        """Find the places of another pattern, and add what is new in it to the union."""
-        known.latest = block
-        union, keys = _keys(known.indptr, known.indices, columns), _keys(block.indptr, block.indices, columns)
-        places = np.searchsorted(union, keys)
-        if not np.array_equal(union[np.minimum(places, union.size - 1)], keys):
+    def _take_rows(self, known: _Block, block: CSR, changed: Mask, columns: int) -> None:
+        """Find which entries of the union are present in rows that changed, and add what is new in them to it."""
+        rows = np.flatnonzero(changed)
+        before, keys = _keys(known.indptr, known.indices, rows, columns), _keys(*block[:2], rows, columns)
+        union = np.union1d(before, keys)
+        present = np.isin(union, keys, assume_unique=True)
+        splice = Splice(known.indptr, changed, np.bincount(union // columns, minlength=rows.size))
+        if known.present is not None or not present.all():
+            everything = np.ones(known.indices.size, dtype=np.bool_)
+            known.present = splice.merge(everything if known.present is None else known.present, present)
+            if known.present.all():
+                known.present = None
+        if union.size > before.size:
             self.grew = True
-            union = np.union1d(union, keys)
-            counts = np.bincount(union // columns, minlength=block.indptr.size - 1)
-            known.indptr = np.concatenate([[0], np.cumsum(counts)])
-            known.indices = union % columns
-            places = np.searchsorted(union, keys)
-        known.places = None if places.size == union.size else places
+            known.indptr, known.indices = splice.indptr, splice.merge(known.indices, union % columns)
 
 
-def _keys(indptr: Integers, indices: Integers, columns: int) -> Integers:
-    """One number per entry that increases by row and column."""
-    rows = np.repeat(np.arange(indptr.size - 1), np.diff(indptr))
-    return np.asarray(rows * columns + indices)
-
-
-def _same_pattern(a: CSR, b: CSR) -> bool:
-    return np.array_equal(a.indptr, b.indptr) and np.array_equal(a.indices, b.indices)
+def _keys(indptr: Integers, indices: Integers, rows: Integers, columns: int) -> Integers:
+    """One number per entry of some rows that increases by row and column."""
+    places, counts = gather_rows(indptr, rows)
+    return np.asarray(np.repeat(np.arange(rows.size), counts) * columns + indices[places])

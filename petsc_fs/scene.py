@@ -172,7 +172,7 @@ class Scene:
 
         Args:
             matrix: (n, n) in compressed rows: anything with `indptr`, `indices` and `data`, such as
-                a `scipy.sparse.csr_matrix`.
+                a `scipy.sparse.csr_matrix`. Columns of a row come in any order.
             rhs: (n,) right-hand side.
             fields: field name to the rows of its equations, as an index array, range or slice.
                 Vector fields list all components of a cell before the next cell.
@@ -224,13 +224,19 @@ class Scene:
             rhs={f: b[row_ids[f]] for f in names},
             **known,
         )
-        scene.validate()
+        scene.validate(cutter.valid if cutter is not None else None)
+        if cutter is not None:
+            cutter.valid = {rc: (block.indptr, block.indices) for rc, block in blocks.items()}
         return scene
 
-    def validate(self) -> None:
+    def validate(self, valid: Mapping[tuple[str, str], tuple[Integers, Integers]] | None = None) -> None:
         """Check that all parts fit together and are finite.
 
         Local: looks at the rows held here and does not communicate.
+
+        Args:
+            valid: `indptr` and `indices` of blocks that have passed in a scene of the same sizes: where a block has
+                these very arrays, only its values are looked at.
 
         Raises:
             LayoutError: a length, block size or column number is wrong.
@@ -263,8 +269,7 @@ class Scene:
         for what in ("rhs", "reference", "cell_centers", "cell_volumes"):
             for name in set(getattr(self, what)) - set(self.sizes):
                 raise LayoutError(f"{what}: the scene has no field {name!r}")
-        for (r, c), block in self.blocks.items():
-            self._check_block(r, c, block)
+        self._check_blocks(valid or {})
         self._check_cell_data()
 
     def _check_length(
@@ -278,7 +283,14 @@ class Scene:
         if not np.isfinite(values).all():
             raise SceneError(f"{name}: {what} has an entry that is not finite (NaN or Inf)")
 
-    def _check_block(self, r: str, c: str, block: CSR) -> None:
+    def _check_blocks(self, valid: Mapping[tuple[str, str], tuple[Integers, Integers]]) -> None:
+        for (r, c), block in self.blocks.items():
+            indptr, indices = valid.get((r, c), (None, None))
+            if block.indptr is not indptr or block.indices is not indices:
+                self._check_pattern(r, c, block)
+            self._check_values(r, c, block)
+
+    def _check_pattern(self, r: str, c: str, block: CSR) -> None:
         for name in (r, c):
             if name not in self.sizes:
                 raise LayoutError(f"block ({r}, {c}): the scene has no field {name!r}")
@@ -298,6 +310,8 @@ class Scene:
             raise LayoutError(f"block ({r}, {c}): a column number is outside 0:{self.sizes[c]}")
         if not increasing(block):
             raise LayoutError(f"block ({r}, {c}): columns of a row must increase, without duplicates")
+
+    def _check_values(self, r: str, c: str, block: CSR) -> None:
         if not np.isfinite(block.data).all():
             at = np.flatnonzero(~np.isfinite(block.data))[0]
             row = int(np.searchsorted(block.indptr, at, side="right")) - 1
@@ -471,22 +485,20 @@ def csr_rows(block: CSR, start: int, stop: int) -> CSR:
     return CSR(block.indptr[start : stop + 1] - a, block.indices[a:b], block.data[a:b])
 
 
-def diagonal_blocks(block: CSR, size: int, first_row: int = 0) -> Floats:
+def diagonal_blocks(block: CSR, size: int) -> Floats:
     """The blocks on the diagonal of a square block, dense.
 
     Args:
-        block: rows from `first_row` on, columns numbered globally.
+        block: rows and columns numbered alike.
         size: of the diagonal blocks.
-        first_row: global number of the first row.
 
     Returns:
         (rows / size, size, size).
     """
     rows = np.repeat(np.arange(block.indptr.size - 1), np.diff(block.indptr))
-    columns = block.indices - first_row
-    inside = rows // size == columns // size
+    inside = rows // size == block.indices // size
     dense = np.zeros(((block.indptr.size - 1) // size, size, size))
-    dense[rows[inside] // size, rows[inside] % size, columns[inside] % size] = block.data[inside]
+    dense[rows[inside] // size, rows[inside] % size, block.indices[inside] % size] = block.data[inside]
     return dense
 
 
@@ -496,9 +508,9 @@ def singular(dense: Floats) -> NDArray[np.bool_]:
     return np.asarray(~(values[:, -1] > ALMOST_SINGULAR * values[:, 0]))
 
 
-def singular_diagonal_blocks(block: CSR, size: int, first_row: int = 0) -> int:
+def singular_diagonal_blocks(block: CSR, size: int) -> int:
     """Number of singular diagonal blocks of a square block, see `diagonal_blocks`."""
-    return int(np.count_nonzero(singular(diagonal_blocks(block, size, first_row))))
+    return int(np.count_nonzero(singular(diagonal_blocks(block, size))))
 
 
 def _indices(spec: Any, n: int) -> Integers:

@@ -11,7 +11,8 @@ rank 0 asks of them, as with PETSc's own `-mpi_linear_solver_server` (PCMPI), wh
         client.stop()
 
 Where a scene goes is decided once: partition, parts of the pattern and places of their values in rank 0's arrays.
-After that, one message per rank brings the values of matrix and right-hand side and the cell data that change.
+After that, one message per rank brings the values of matrix and right-hand side and the cell data that change. Where
+the pattern of a block grows, it is decided again for that block.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -36,7 +37,7 @@ from petsc_fs.errors import SolveError, UsageError, portable, together
 from petsc_fs.layout import Layout
 from petsc_fs.pattern import UnionPattern
 from petsc_fs.scene import Floats, Integers, Scene
-from petsc_fs.transfer import Plan, Structure, changes_of, same_frame
+from petsc_fs.transfer import Plan, Structure, changes_of, same_frame, with_room
 
 if TYPE_CHECKING:
     from petsc_fs.solver import Result, Solver
@@ -216,19 +217,23 @@ class ServedSolver:
         PETSc's objects are kept where sizes and cells are the same and every entry has been there before.
         """
         started = time.perf_counter()
-        known = self._client.rank.knows(self._handle)
-        if self._like is None or not known or not same_frame(scene, self._like):
+        like, self._like = self._like, None  # an error on the way leaves nothing to start from
+        anew = like is None or not self._client.rank.knows(self._handle) or not same_frame(scene, like)
+        if anew:
             self._union = UnionPattern()
             self.layout = self._client.call("make_layout", self._handle, self.prefix, load=scene)
         fitted = self._union.fit(scene)
-        if self._union.grew:
+        if anew or self._union.grew:
             self.rebuilds += 1
-            self._plan = Plan(fitted, self.layout)
+            if anew:
+                self._plan = Plan(fitted, self.layout)
+            else:
+                self._plan.grow(fitted)
             self._client.call("take_structure", self._handle, load=self._plan.take_structures())
-        self._like = replace(scene, blocks={}, rhs={}, reference={})
         packed = self._plan.pack(fitted), self._plan.counts
         self.transfer_seconds = time.perf_counter() - started
         self.transfer_seconds += self._client.call("take_values", self._handle, changes_of(fitted), load=packed)
+        self._like = replace(scene, blocks={}, rhs={}, reference={})
 
     def solve(self, rtol: float | None = None) -> Result:
         """Solve; see `petsc_fs.solver.Solver.solve`.
@@ -259,12 +264,12 @@ class ServedSolver:
 
 @dataclass
 class _Kept:
-    """What a rank keeps of one solver."""
+    """What a rank keeps of one solver; rank 0 no values, of which it has those of all ranks."""
 
     prefix: str
     layout: Layout
     structure: Structure | None = None
-    values: Floats | None = None
+    values: Floats = field(default_factory=lambda: np.empty(0))
     solver: Solver | None = None
 
 
@@ -348,15 +353,18 @@ class _Rank:
         return layout
 
     def take_structure(self, handle: int, structures: list[Structure] | None = None) -> None:
-        """Get from rank 0 what stays the same from solve to solve."""
+        """Get from rank 0 what stays the same from solve to solve.
+
+        A solver that is there stays: its update makes those blocks anew that have grown.
+        """
         kept = self._kept[handle]
-        kept.values = None  # the solver stays: its update makes those blocks anew that have grown
         if structures is None:
-            kept.structure = self.control.recv(source=0)
-            return
-        kept.structure, *others = structures
-        for rank, structure in enumerate(others, start=1):
-            self.control.send(structure, rank)
+            own = self.control.recv(source=0)
+        else:
+            own, *others = structures
+            for rank, structure in enumerate(others, start=1):
+                self.control.send(structure, rank)
+        kept.structure = own if kept.structure is None else kept.structure.grown(own)
 
     def take_values(self, handle: int, changes: dict[str, Any], load: tuple[Floats, Integers] | None = None) -> float:
         """Get the values from rank 0, and build or update the system; seconds that the values took to come."""
@@ -364,10 +372,16 @@ class _Rank:
         kept = self._kept[handle]
         assert kept.structure is not None
         with together(self.comm):  # memory may run out on one of them
-            values = np.empty(kept.structure.size) if kept.values is None else kept.values
-        kept.values = values
-        self.comm.Scatterv(None if load is None else [load[0], load[1]], kept.values, root=0)
-        part = kept.structure.part(kept.values, changes)
+            size = kept.structure.size
+            if load is None:
+                kept.values = with_room(kept.values, size)
+        if load is not None:
+            values = load[0][:size]
+            self.comm.Scatterv([load[0], load[1]], MPI.IN_PLACE, root=0)
+        else:
+            values = kept.values[:size]
+            self.comm.Scatterv(None, values, root=0)
+        part = kept.structure.part(values, changes)
         seconds = time.perf_counter() - started
         if kept.solver is None:
             from petsc_fs.solver import Solver

@@ -6,7 +6,6 @@ to know once. After that the values of a scene are one array per rank.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -28,7 +27,7 @@ class Structure:
 
     Attributes:
         frame: the part without matrix, right-hand side, contact states and material.
-        patterns: `indptr` and `indices` of each block.
+        patterns: `indptr` and `indices` of each block, or of those that are new to the rank.
         pieces: arrays that make up the values, in their order, and their lengths.
     """
 
@@ -40,6 +39,10 @@ class Structure:
     def size(self) -> int:
         """Number of values."""
         return sum(length for _, length in self.pieces)
+
+    def grown(self, later: Structure) -> Structure:
+        """What is known after blocks have got other patterns: `later` has those of these blocks only."""
+        return replace(later, patterns=self.patterns | later.patterns)
 
     def part(self, values: Floats, changes: Mapping[str, Any]) -> Scene:
         """The part of the scene that has these values, by reference.
@@ -121,15 +124,31 @@ class Plan:
         """
         self.layout = layout
         self._structures: list[Structure] = []
-        self._takes: list[list[tuple[Piece, slice | Integers]]] = []
-        # Restricted like a scene, the numbers of its entries end up where the entries belong
-        numbered = {
-            rc: CSR(b.indptr, b.indices, np.arange(b.data.size, dtype=np.float64)) for rc, b in scene.blocks.items()
+        self._planned: dict[tuple[str, str], tuple[Integers, Integers]] = {}
+        self._takes: list[dict[Piece, tuple[slice | Integers, int]]] = [{} for _ in range(layout.comm.size)]
+        self._packed = np.empty(0)
+        self.counts: Integers = np.zeros(layout.comm.size, dtype=np.int64)
+        self.grow(scene)
+
+    def grow(self, scene: Scene) -> None:
+        """Plan for scenes of the same frame in which some blocks have other patterns.
+
+        Args:
+            scene: all rows; `indptr` and `indices` of blocks that have not changed are the very arrays of before.
+        """
+        patterns = {rc: (block.indptr, block.indices) for rc, block in scene.blocks.items()}
+        new = {
+            rc: pattern
+            for rc, pattern in patterns.items()
+            if rc not in self._planned or any(a is not b for a, b in zip(pattern, self._planned[rc], strict=True))
         }
+        # Restricted like a scene, the numbers of its entries end up where the entries belong
+        numbered = {rc: CSR(*pattern, np.arange(pattern[1].size, dtype=np.float64)) for rc, pattern in new.items()}
         bare = replace(scene, blocks=numbered, reference={}, contact_state=None, material=None)
-        for rank in range(layout.comm.size):
-            seen: Any = _At(rank, layout.comm.size)
-            view = replace(layout, comm=seen)
+        self._structures = []
+        for rank, takes in enumerate(self._takes):
+            seen: Any = _At(rank, self.layout.comm.size)
+            view = replace(self.layout, comm=seen)
             part = bare.restrict(view)
             places: dict[Piece, Integers] = {("blocks", rc): b.data.astype(np.int64) for rc, b in part.blocks.items()}
             places |= {("rhs", f): view.own_rows(f) for f in part.sizes}
@@ -138,30 +157,36 @@ class Plan:
             if scene.material is not None:
                 arrays = [name for name, value in scene.material.cell_data().items() if np.ndim(value)]
                 places |= {("material", name): view.own_cells("mass") for name in arrays}
-            self._takes.append([(piece, _selection(at)) for piece, at in places.items()])
+            takes |= {piece: (_selection(at), at.size) for piece, at in places.items()}
             self._structures.append(
                 Structure(
                     replace(part, blocks={}, rhs={}),
                     {rc: (b.indptr, b.indices) for rc, b in part.blocks.items()},
-                    [(piece, at.size) for piece, at in places.items()],
+                    [(piece, length) for piece, (_, length) in takes.items()],
                 )
             )
-        self.counts = np.array([structure.size for structure in self._structures])
+        self._planned = patterns
+        self.counts = np.array([sum(length for _, length in takes.values()) for takes in self._takes])
 
     def take_structures(self) -> list[Structure]:
-        """What each rank has to know, to be sent once: it is forgotten here."""
+        """What each rank has to know, to be sent once: it is forgotten here. Of blocks, only those that are new."""
         taken, self._structures = self._structures, []
         return taken
 
     def pack(self, scene: Scene) -> Floats:
-        """All values of a scene, those of rank 0 first."""
-        packed = np.empty(self.counts.sum())
+        """All values of a scene, those of rank 0 first, in an array that the next call uses again."""
+        total = int(self.counts.sum())
+        self._packed = with_room(self._packed, total)
         end = 0
-        for (kind, key), selection in itertools.chain.from_iterable(self._takes):
-            values = _values(scene, kind, key)[selection]
-            packed[end : end + values.size] = values
-            end += values.size
-        return packed
+        for takes in self._takes:
+            for (kind, key), (selection, length) in takes.items():
+                values, room = _values(scene, kind, key), self._packed[end : end + length]
+                if isinstance(selection, slice):
+                    room[:] = values[selection]
+                else:
+                    np.take(values, selection, out=room, mode="clip")  # which clips nothing, but spares a copy of room
+                end += length
+        return self._packed[:total]
 
     def unpack(self, parts: Floats) -> dict[str, Floats]:
         """Per field all rows in the scene's numbering, from the local rows of all ranks, those of rank 0 first."""
@@ -174,6 +199,14 @@ class Plan:
                 pieces[f].append(parts[end : end + length])
                 end += length
         return {f: layout.to_scene(f, np.concatenate(piece)) for f, piece in pieces.items()}
+
+
+def with_room(array: Floats, size: int) -> Floats:
+    """An array with room for so many numbers: the same one where it has it, else one that has some to spare.
+
+    Patterns grow little by little, and to receive into memory that was never used takes several times as long.
+    """
+    return array if array.size >= size else np.empty(size + size // 16)
 
 
 def _selection(places: Integers) -> slice | Integers:
@@ -191,4 +224,5 @@ def _values(scene: Scene, kind: str, key: Any) -> NDArray[Any]:
         return scene.blocks[key].data
     if kind == "rhs":
         return scene.rhs[key]
-    return np.asarray(scene.contact_state if kind == "contact_state" else getattr(scene.material, key))
+    values = scene.contact_state if kind == "contact_state" else getattr(scene.material, key)
+    return np.asarray(values, dtype=np.float64)

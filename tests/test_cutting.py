@@ -5,6 +5,7 @@ import pytest
 from sample import csr, dense, full_scene
 
 from petsc_fs.cutting import Cutter
+from petsc_fs.errors import LayoutError, SceneError
 from petsc_fs.scene import CSR, Scene
 
 
@@ -79,3 +80,88 @@ def test_other_rows_or_columns_are_no_mistake(which):
     changed[which] = {f: index[::-1] for f, index in changed[which].items()}
     found = Scene.from_matrix(A, rhs, changed["rows"], columns=changed["columns"], dimension=2, cutter=cutter)
     assert_same_blocks(found, Scene.from_matrix(A, rhs, changed["rows"], columns=changed["columns"], dimension=2))
+
+
+def changing(seed: int) -> list[CSR]:
+    """Matrices in which entries of some rows come and go; now and then all rows change, or none."""
+    rng = np.random.default_rng(seed)
+    n = sum(full_scene().sizes.values())
+    pattern = rng.random((n, n)) < 0.2
+    matrices = []
+    for rate in (0.0, 0.002, 0.0, 0.02, 0.002, 1.0, 0.002, 0.3):
+        pattern = pattern ^ (rng.random((n, n)) < rate)
+        A = csr(pattern * rng.standard_normal((n, n)))
+        for a, b in zip(A.indptr[:-1], A.indptr[1:], strict=True):
+            order = np.random.default_rng(b - a).permutation(b - a)
+            A.indices[a:b], A.data[a:b] = A.indices[a:b][order], A.data[a:b][order]
+        matrices.append(A)
+    return matrices
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_rows_that_come_and_go_are_cut_as_without_memory(seed):
+    """Fields that lie in one piece, and fields that do not; scenes from earlier cuts stay as they are."""
+    cutter = Cutter()
+    _, scattered, columns = scrambled(5)
+    bounds = np.cumsum([0, *full_scene().sizes.values()])
+    rows = scattered if seed % 2 else {f: np.arange(bounds[k], bounds[k + 1]) for k, f in enumerate(scattered)}
+    pairs = []
+    for A in changing(seed):
+        rhs = np.zeros(A.indptr.size - 1)
+        found = Scene.from_matrix(A, rhs, rows, columns=columns, dimension=2, cutter=cutter)
+        pairs.append((found, Scene.from_matrix(A, rhs, rows, columns=columns, dimension=2)))
+    for found, expected in pairs:
+        assert_same_blocks(found, expected)
+
+
+def test_a_block_keeps_its_arrays_where_only_others_of_its_rows_change():
+    cutter = Cutter()
+    A, rows, columns = scrambled(5)
+    rhs = np.zeros(A.indptr.size - 1)
+    first = Scene.from_matrix(A, rhs, rows, columns=columns, dimension=2, cutter=cutter)
+    row_of = np.repeat(np.arange(A.indptr.size - 1), np.diff(A.indptr))
+    keep = ~(np.isin(row_of, rows["mass"][:2]) & np.isin(A.indices, columns["contact"]))
+    assert not keep.all()
+    B = CSR(np.concatenate([[0], np.cumsum(keep)])[A.indptr], A.indices[keep], A.data[keep])
+    second = Scene.from_matrix(B, rhs, rows, columns=columns, dimension=2, cutter=cutter)
+    changed = {rc for rc, b in second.blocks.items() if b.indices is not first.blocks[rc].indices}
+    assert changed == {("mass", "contact")}
+    assert_same_blocks(second, Scene.from_matrix(B, rhs, rows, columns=columns, dimension=2))
+
+
+def test_an_entry_given_twice_is_refused_and_does_no_harm():
+    cutter = Cutter()
+    A, rows, columns = scrambled(5)
+    rhs = np.zeros(A.indptr.size - 1)
+    column = A.indices[0]
+    B = CSR(A.indptr + (np.arange(A.indptr.size) > 0), np.insert(A.indices, 0, column), np.insert(A.data, 0, 1.0))
+    for _ in range(2):
+        with pytest.raises(LayoutError, match="columns of a row must increase, without duplicates"):
+            Scene.from_matrix(B, rhs, rows, columns=columns, dimension=2, cutter=cutter)
+    found = Scene.from_matrix(A, rhs, rows, columns=columns, dimension=2, cutter=cutter)
+    assert_same_blocks(found, Scene.from_matrix(A, rhs, rows, columns=columns, dimension=2))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_values_from_memory_are_looked_at_as_any_others(value):
+    cutter = Cutter()
+    A, rows, columns = scrambled(5)
+    rhs = np.zeros(A.indptr.size - 1)
+    Scene.from_matrix(A, rhs, rows, columns=columns, dimension=2, cutter=cutter)
+    data = A.data.copy()
+    data[A.indptr[rows["momentum"][3]]] = value
+    with pytest.raises(SceneError, match=r"block \(momentum, \w+\): row 3 has an entry that is not finite"):
+        Scene.from_matrix(A._replace(data=data), rhs, rows, columns=columns, dimension=2, cutter=cutter)
+    assert cutter.hits == len(rows)
+
+
+def test_only_the_very_arrays_that_passed_are_taken_for_valid():
+    scene = full_scene()
+    valid = {rc: (b.indptr, b.indices) for rc, b in scene.blocks.items()}
+    block = scene.blocks["mass", "mass"]
+    falling = block.indices[::-1].copy()
+    scene.blocks["mass", "mass"] = block._replace(indices=falling)
+    for known in (None, {}, valid):
+        with pytest.raises(LayoutError, match=r"block \(mass, mass\): columns of a row must increase"):
+            scene.validate(known)
+    scene.validate(valid | {("mass", "mass"): (block.indptr, falling)})

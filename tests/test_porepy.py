@@ -338,6 +338,28 @@ def test_reduced_system(captured):
         model.linear_system = full
 
 
+@pytest.mark.parametrize("columns", [2, 3])
+def test_zeros_and_entries_given_twice_make_no_difference(captured, columns):
+    """Each entry comes as two halves, and as a third a zero somewhere."""
+    from scipy.sparse import csr_matrix
+
+    model, adapter, *_ = captured("model1", "mixed")
+    full = model.linear_system
+    expected = adapter.scene()
+    A = full[0].tocsr()
+    indices = np.stack([A.indices, A.indices, np.zeros_like(A.indices)], axis=1)[:, :columns]
+    data = A.data[:, None] * np.array([0.5, 0.5, 0.0])[:columns]
+    model.linear_system = (csr_matrix((data.ravel(), indices.ravel(), columns * A.indptr), A.shape), full[1])
+    try:
+        found = adapter.scene()
+    finally:
+        model.linear_system = full
+    assert found.blocks.keys() == expected.blocks.keys()
+    for rc, block in found.blocks.items():
+        for mine, other in zip(block, expected.blocks[rc], strict=True):
+            assert_array_equal(mine, other)
+
+
 def test_solution_of_wrong_length(captured):
     adapter = captured("model1")[1]
     with pytest.raises(LayoutError, match="contact: expected 12 values, found nothing"):

@@ -78,6 +78,35 @@ def test_union_pattern_keeps_a_block_that_disappears():
     assert np.array_equal(fitted.blocks["contact", "intf_force"].indices, whole.blocks["contact", "intf_force"].indices)
 
 
+def thinned(scene: Scene, rng: np.random.Generator, share: float) -> Scene:
+    """The scene without some entries; some of its blocks have all, others may have none."""
+    for rc, block in scene.blocks.items():
+        gone = share * rng.integers(0, 3)
+        scene = sparser(scene, rc, np.flatnonzero(rng.random(block.data.size) >= gone))
+    return replace(scene, blocks={rc: block for rc, block in scene.blocks.items() if block.data.size})
+
+
+@pytest.mark.parametrize("share", [0.01, 0.2, 0.5])
+def test_union_pattern_of_random_changes_is_the_union(share):
+    """Row by row against sets of places: the least pattern that has all, and it grows when a place is new."""
+    rng, whole, union = np.random.default_rng(7), full_scene(), UnionPattern()
+    seen: set[tuple[int, int]] = set()
+    earlier: dict = {}
+    for _ in range(12):
+        scene = thinned(whole, rng, share)
+        fitted = union.fit(scene)
+        fitted.validate()
+        assert np.array_equal(dense(fitted), dense(scene))
+        places = set(zip(*np.nonzero(dense(scene)), strict=True))
+        assert union.grew == bool(places - seen)
+        seen |= places
+        ones = {rc: CSR(b.indptr, b.indices, np.ones(b.data.size)) for rc, b in fitted.blocks.items()}
+        assert set(zip(*np.nonzero(dense(replace(fitted, blocks=ones))), strict=True)) == seen
+        if not union.grew:
+            assert all(b.indices is earlier[rc].indices for rc, b in fitted.blocks.items())
+        earlier = fitted.blocks
+
+
 # Transfer
 
 
@@ -113,6 +142,33 @@ def test_what_arrives_is_the_part_of_the_scene(dimension, ranks, mixed):
     local = [values[f][replace(layout, comm=Ranks(rank, ranks)).own_rows(f)] for rank in range(ranks) for f in values]
     for f, back in plan.unpack(np.concatenate(local)).items():
         assert np.array_equal(back, values[f])
+
+
+@pytest.mark.parametrize("ranks", [1, 3])
+def test_what_arrives_after_patterns_have_grown_is_the_part_of_the_scene(ranks):
+    """Random changes: ranks are told of new blocks only, and know what they would know of a plan made anew."""
+    whole, rng, union = full_scene(), np.random.default_rng(3), UnionPattern()
+    cells = {f: n // whole.block_size(f) for f, n in whole.sizes.items()}
+    layout = Layout.from_owners(Ranks(0, ranks), 2, {f: rng.integers(0, ranks, n) for f, n in cells.items()})
+    plan, known, told = None, [], []
+    for _ in range(8):
+        scene = union.fit(thinned(whole, rng, 0.05))
+        if plan is None:
+            plan = Plan(scene, layout)
+            known = plan.take_structures()
+        elif union.grew:
+            plan.grow(scene)
+            later = plan.take_structures()
+            told.append(len(later[0].patterns))
+            known = [structure.grown(new) for structure, new in zip(known, later, strict=True)]
+        packed = plan.pack(scene)
+        starts = np.concatenate([[0], np.cumsum(plan.counts)])
+        assert packed.size == starts[-1]
+        for rank, structure in enumerate(known):
+            expected = replace(scene, reference={}).restrict(replace(layout, comm=Ranks(rank, ranks)))
+            assert structure.size == plan.counts[rank]
+            assert_same(structure.part(packed[starts[rank] : starts[rank + 1]], changes_of(scene)), expected)
+    assert 0 < min(told) < len(whole.blocks)
 
 
 def test_what_a_plan_depends_on():

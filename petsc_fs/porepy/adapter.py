@@ -105,22 +105,32 @@ class Adapter:
                 "scene from within a Newton step"
             )
         matrix, rhs = model.linear_system
-        rows, columns = self.rows, self.columns
-        n = sum(index.size for index in columns.values())
+        n = sum(index.size for index in self.columns.values())
         if matrix.shape != (n, n):
             raise LayoutError(
                 f"the linear system of the model is {matrix.shape[0]} x {matrix.shape[1]}, but its equation "
                 f"system has {n} unknowns; take the scene from the full system, before any reduction"
             )
-        matrix = matrix.tocsr()  # of the model itself if it is in rows already: the same matrix in its canonical form
-        matrix.sum_duplicates()
-        matrix.eliminate_zeros()
-        cells = {f: self._grids[f] for f in rows}
+        matrix = matrix.tocsr()  # of the model itself if it is in rows already: without zeros the same matrix
+        if (matrix.data == 0).any():
+            matrix.eliminate_zeros()
+        try:
+            return self._cut(matrix, rhs)
+        except LayoutError:
+            entries = matrix.nnz
+            matrix.sum_duplicates()  # takes as long as all else, and PorePy's matrices have none
+            if matrix.nnz == entries:
+                raise
+            return self._cut(matrix, rhs)
+
+    def _cut(self, matrix: Any, rhs: Floats) -> Scene:
+        """The scene of a matrix in compressed rows, and what else the model knows."""
+        model, cells = self.model, {f: self._grids[f] for f in self._rows}
         return Scene.from_matrix(
             matrix,
             rhs,
-            rows,
-            columns=columns,
+            self._rows,
+            columns=self._columns,
             cutter=self._cutter,
             dimension=model.nd,
             cell_centers={f: np.concatenate([g.cell_centers.T for g in gs]) for f, gs in cells.items()},
