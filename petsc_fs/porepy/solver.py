@@ -29,14 +29,13 @@ from petsc_fs.errors import SceneError, SolveError, UsageError
 from petsc_fs.fields import in_order
 from petsc_fs.forcing import EisenstatWalker, EisenstatWalkerParameters
 from petsc_fs.memory import return_freed
-from petsc_fs.pattern import UnionPattern
 from petsc_fs.scene import Scene, contact_state_counts
 from petsc_fs.tree import Facts, Tree, shipped_tree
 
 if TYPE_CHECKING:
     from petsc_fs.porepy.adapter import Adapter
     from petsc_fs.server import ServedSolver
-    from petsc_fs.solver import Result, Solver
+    from petsc_fs.solver import Result
 
 Floats = NDArray[np.float64]
 
@@ -178,11 +177,10 @@ class FieldSplitSolver:
         super().__init__(*args, **kwargs)
         self.linear_solves = []
         self._adapter: Adapter | None = None
-        self._solver: Solver | ServedSolver | None = None
+        self._solver: ServedSolver | None = None
         self._chosen: _Chosen | None = None
         self._facts: Facts | None = None
         self._forcing: EisenstatWalker | None = None
-        self._union = UnionPattern()
         self._newton_tolerance: float | None = None
         self._reference_residual: Floats | None = None
         self._earlier_rebuilds = 0
@@ -375,30 +373,19 @@ class FieldSplitSolver:
             setattr(second, name, getattr(first, name) + getattr(second, name))
         return second
 
-    def _updated_solver(self, scene: Scene) -> Solver | ServedSolver:
-        """The solver with the values of the scene; a new one where the grids have changed."""
-        if self._client is None:  # a served solver sees to these itself
-            if self._solver is not None:
-                layout = self._solver.layout
-                if {f: n for f, n in scene.sizes.items() if n} != {f: layout.sizes(f)[1] for f in layout.fields}:
-                    self._forget_solver()
-            if self._solver is None:
-                self._union = UnionPattern()
-            scene = self._union.fit(scene)
+    def _updated_solver(self, scene: Scene) -> ServedSolver:
+        """The solver with the values of the scene."""
         if self._solver is None:
             self._solver = self._create_solver(scene, self._options_prefix)
         else:
             self._solver.update(scene)
         return self._solver
 
-    def _create_solver(self, scene: Scene, prefix: str) -> Solver | ServedSolver:
-        if self._client is not None:
-            return server.ServedSolver(self._client, scene, prefix=prefix)
-        from petsc4py import PETSc
-
-        from petsc_fs.solver import Solver
-
-        return Solver(scene, PETSc.COMM_SELF.tompi4py(), prefix=prefix)
+    def _create_solver(self, scene: Scene, prefix: str) -> ServedSolver:
+        if self._client is None:  # on one rank; PETSc starts no earlier than with the first system
+            self._client = server.start()
+        assert self._client is not None
+        return server.ServedSolver(self._client, scene, prefix=prefix)
 
     def _forget_solver(self) -> None:
         if self._solver is not None:
@@ -411,7 +398,7 @@ class FieldSplitSolver:
         return self._earlier_rebuilds + (self._solver.rebuilds if self._solver is not None else 0)
 
 
-def _outcome(solver: Solver | ServedSolver, result: Result) -> _Outcome:
+def _outcome(solver: ServedSolver, result: Result) -> _Outcome:
     """What came of a solve, in words if it missed its tolerance."""
     failure = ""
     if not result.converged:
@@ -420,8 +407,7 @@ def _outcome(solver: Solver | ServedSolver, result: Result) -> _Outcome:
             f"{result.true_relative_residual:.2e}, tolerance {result.tolerance:.2e}"
             + "".join(f"; {note}" for note in result.notes)
         )
-    transfer = getattr(solver, "transfer_seconds", 0.0)
-    return _Outcome(result, "", failure, result.setup_seconds, result.solve_seconds, transfer)
+    return _Outcome(result, "", failure, result.setup_seconds, result.solve_seconds, solver.transfer_seconds)
 
 
 def _fitting_file(name: str, scene: Scene) -> Path:
