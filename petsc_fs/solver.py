@@ -407,9 +407,7 @@ class Solver:
             return True
         known = bool(result.estimated_error_by_field)
         scaled = self._scale_rows(result.solution, SPREAD["always" if known else "auto"])
-        if known and scaled:
-            self.ksp.setTolerances(atol=0.0)  # which may be what stopped it too early
-        elif known:
+        if known and not scaled:
             worst = max(result.estimated_error_by_field.values())
             aim = min(result.error_tolerance, DOUBTFUL * wanted)
             tighter = max(0.1 * wanted * min(1.0, aim / worst), EPS)
