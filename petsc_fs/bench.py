@@ -46,7 +46,6 @@ CLOCKS = ("wall", "cpu")
 DEFAULT_BASE = "contact_poromechanics.opts -petsc_fs_ordering natural"
 """Options file that others are compared to: the published configuration, with cells in the order of the scene."""
 
-
 TWICE = {6, 8, 16}
 """hypre's smoothers that go through the matrix twice: symmetric Gauss-Seidel, the same with l1 scaling, and Chebyshev
 polynomials of second order."""

@@ -18,7 +18,7 @@ from petsc_fs import hdf5
 from petsc_fs.errors import LayoutError, SceneError, together
 from petsc_fs.fields import FIELD
 from petsc_fs.layout import Cells, Layout, rows_of
-from petsc_fs.partition import Coupling, Places, fit_cache, graph_block, layout_of, needed, parts_of, primary_field
+from petsc_fs.partition import Coupling, Places, graph_block, layout_of, needed, needs_places, parts_of, primary_field
 from petsc_fs.redistribution import Redistribution, Transfer, run, shares
 from petsc_fs.scene import CSR, Material, Scene, increasing, renumber
 
@@ -166,8 +166,7 @@ class _Reader:
     def layout(self, kind: str, ordering: str, prefix: str) -> Layout:
         """Where cells go. Collective."""
         places = Places(self.dimension, self.cells)
-        ordered = ordering == "morton" or (ordering == "auto" and not fit_cache(self.cells, self.comm.size))
-        if kind != "contiguous" and (self.comm.size > 1 or ordered):
+        if needs_places(self.cells, self.comm.size, kind, ordering):
             places = self._places(kind)
         parts = None
         with together(self.comm):
@@ -190,7 +189,8 @@ class _Reader:
         with together(self.comm), self._explained():
             couplings = {rc: self._coupling(rc, found.pop(0), found.pop(0)) for rc in pairs}
         graph = None
-        if kind == "ptscotch" or (kind == "auto" and primary_field(self.cells) not in centers):
+        by_graph = kind == "ptscotch" or (kind == "auto" and primary_field(self.cells) not in centers)
+        if by_graph and self.comm.size > 1:
             name = graph_block(self.dimension, self.cells, dimension) if self.comm.rank == 0 else ""
             name = self.comm.bcast(name)
             if (name, name) in self.blocks:

@@ -147,9 +147,15 @@ def primary_field(cells: Mapping[str, int]) -> str:
     return max(in_order(cells), key=lambda f: cells[f])
 
 
-def fit_cache(cells: Mapping[str, int], ranks: int) -> bool:
-    """Whether each of so many ranks has so few cells that their order does not matter."""
-    return cells[primary_field(cells)] <= CELLS_IN_CACHE * ranks
+def is_ordered(cells: Mapping[str, int], ranks: int, ordering: str) -> bool:
+    """Whether cells leave the order of the scene, where their centres are known."""
+    many = cells[primary_field(cells)] > CELLS_IN_CACHE * ranks
+    return ordering == "morton" or (ordering == "auto" and many)
+
+
+def needs_places(cells: Mapping[str, int], ranks: int, kind: str, ordering: str) -> bool:
+    """Whether a partition looks at more than the numbers of cells."""
+    return kind != "contiguous" and (ranks > 1 or is_ordered(cells, ranks, ordering))
 
 
 def graph_block(dimension: int, cells: Mapping[str, int], cell_dimension: Integers | None) -> str:
@@ -200,7 +206,10 @@ def partition(
         if comm.rank == 0:
             if scene is None:
                 raise SceneError("partition: rank 0 has no scene")
-            parts = parts_of(Places.of(scene), comm.size, kind, ordering, prefix)
+            places = Places(scene.dimension, {f: n // scene.block_size(f) for f, n in scene.sizes.items()})
+            if needs_places(places.cells, comm.size, kind, ordering):
+                places = Places.of(scene)
+            parts = parts_of(places, comm.size, kind, ordering, prefix)
             dimension = scene.dimension
     return layout_of(parts, comm, dimension if comm.rank == 0 else 0)
 
@@ -248,9 +257,8 @@ def parts_of(places: Places, ranks: int, kind: str = "auto", ordering: str = "au
         raise UsageError(
             f"-{prefix}petsc_fs_ordering morton: -{prefix}petsc_fs_partition contiguous keeps the scene's; use rcb"
         )
-    if ordering == "auto":
-        ordering = "natural" if centers is None or fit_cache(places.cells, ranks) else "morton"
-    if kind == "contiguous" or (ranks == 1 and ordering == "natural"):
+    ordered = centers is not None and is_ordered(places.cells, ranks, ordering)
+    if kind == "contiguous" or (ranks == 1 and not ordered):
         chunks = {f: np.arange(1, ranks + 1) * n // ranks for f, n in places.cells.items()}
         owners = {f: np.searchsorted(c, np.arange(places.cells[f]), side="right") for f, c in chunks.items()}
         return Parts(owners, {f: np.arange(n) for f, n in places.cells.items()})
@@ -269,7 +277,7 @@ def parts_of(places: Places, ranks: int, kind: str = "auto", ordering: str = "au
     elif ranks > 1:
         name, cells, part_of = _graph_parts(places, ranks, prefix)
         part[anchor[name][cells]] = part_of
-    order = morton(centers) if ordering == "morton" and centers is not None else np.arange(weights.size)
+    order = morton(places.centers[primary]) if ordered else np.arange(weights.size)
     return Parts({f: part[a] for f, a in anchor.items()}, {f: order[a] for f, a in anchor.items()})
 
 

@@ -207,7 +207,7 @@ class FieldSplitSolver:
             outcome = self._solve_by_policy(scene, self._forcing_term(residual))
             if not self.linear_solves:
                 self._refuse_unused(chosen)
-        assert outcome.result is not None
+        assert outcome.result is not None and self._client is not None
         back = time.perf_counter()
         update = self._adapter.to_porepy(outcome.result.solution)
         states = scene.contact_state
@@ -216,7 +216,7 @@ class FieldSplitSolver:
                 time_step=scene.metadata.time_step_index,
                 newton_index=scene.metadata.newton_index,
                 unknowns=update.size,
-                ranks=1 if self._client is None else self._client.comm.size,
+                ranks=self._client.comm.size,
                 iterations=outcome.result.iterations,
                 reason=outcome.result.reason,
                 converged=outcome.result.converged,
