@@ -2,7 +2,7 @@
 
 import sys
 
-from petsc_fs.cli import main
+from petsc_fs.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

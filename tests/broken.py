@@ -29,12 +29,13 @@ from hypothesis import strategies as st
 from mpi4py import MPI
 from sample import CELLS, csr, full_scene
 
-from petsc_fs import hdf5, options
+from petsc_fs import options
 from petsc_fs.errors import PetscFsError
 from petsc_fs.fields import FIELD_NAMES
-from petsc_fs.files import write_text
-from petsc_fs.measure import environment
+from petsc_fs.io import hdf5
+from petsc_fs.io.files import write_text
 from petsc_fs.scene import Scene
+from petsc_fs.tools.measure import environment
 
 BATCH = 250
 LIMIT = 30.0
@@ -373,8 +374,8 @@ def use(path: Path, file: Path | None, comm: MPI.Intracomm) -> str:
     """Read a scene, solve it and write what came out, as `petsc-fs solve` does. Collective."""
     from petsc4py import PETSc
 
-    from petsc_fs.cli import tree_for
-    from petsc_fs.distributed_reader import read_distributed
+    from petsc_fs.cli.main import tree_for
+    from petsc_fs.io.reader import read_distributed
     from petsc_fs.solver import Solver
 
     new: tuple[str, ...] = ()

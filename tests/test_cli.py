@@ -17,9 +17,10 @@ import pytest
 from sample import SCENES
 
 import petsc_fs
-from petsc_fs import hdf5, options
-from petsc_fs.cli import find_scene, split_arguments
+from petsc_fs import options
+from petsc_fs.cli.main import find_scene, split_arguments
 from petsc_fs.errors import SceneError
+from petsc_fs.io import hdf5
 from petsc_fs.scene import contact_state_counts
 
 MPIEXEC = Path(petsc_fs.__path__[0]).parent / "scripts" / "mpiexec"

@@ -13,11 +13,12 @@ from typing import Any
 import matplotlib.pyplot as plt
 import pytest
 
-from petsc_fs import choosing, compare, compare_page, compare_plots
-from petsc_fs.cli import main
-from petsc_fs.compare import Case, Comparison, Entry, Spread
+from petsc_fs import choosing
+from petsc_fs.cli.main import main
 from petsc_fs.errors import UsageError
-from petsc_fs.measure import EMPTY
+from petsc_fs.tools import compare, compare_page, compare_plots
+from petsc_fs.tools.compare import Case, Comparison, Entry, Spread
+from petsc_fs.tools.measure import EMPTY
 
 FIELDS = {"momentum": 8, "mass": 4}
 

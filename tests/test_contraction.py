@@ -7,12 +7,12 @@ import pytest
 from numpy.testing import assert_allclose
 from sample import SCENES, csr, dense
 
-from petsc_fs import hdf5
-from petsc_fs.cli import main
-from petsc_fs.contraction import contact_rows, contraction_rate, coupling_term, evaluate, korn_trace
+from petsc_fs.cli.main import main
 from petsc_fs.errors import SceneError
 from petsc_fs.fixed_stress import analytic_coefficients
+from petsc_fs.io import hdf5
 from petsc_fs.scene import CSR, Material, Scene
+from petsc_fs.tools.contraction import contact_rows, contraction_rate, coupling_term, evaluate, korn_trace
 
 C, UNIT, F = 0.7, 3e4, 0.4
 

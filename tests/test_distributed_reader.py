@@ -10,9 +10,10 @@ from mpi4py import MPI
 from sample import SCENES, assert_same, full_scene
 from test_hdf5 import DAMAGE, NOT_SCENES
 
-from petsc_fs import hdf5, redistribution
-from petsc_fs.distributed_reader import read_distributed
+from petsc_fs import redistribution
 from petsc_fs.errors import SceneError
+from petsc_fs.io import hdf5
+from petsc_fs.io.reader import read_distributed
 from petsc_fs.partition import has_partitioner, partition
 from petsc_fs.redistribution import Redistribution, Transfer, run, shares
 

@@ -9,14 +9,14 @@ from petsc4py import PETSc
 from test_server import on_rank_0
 
 from petsc_fs import options
-from petsc_fs.cli import tree_for
+from petsc_fs.cli.main import tree_for
 from petsc_fs.errors import SceneError, UsageError
 from petsc_fs.fallback import RUNGS, leaves
 from petsc_fs.levels import levels
 from petsc_fs.scene import Scene
 from petsc_fs.server import ServedSolver
 from petsc_fs.solver import Result, Solver
-from petsc_fs.stress_cases import load, with_block_of_cell
+from petsc_fs.tools.stress_cases import load, with_block_of_cell
 
 comm, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 FAST = "contact_poromechanics_fast.opts"

@@ -3,7 +3,7 @@
 import pytest
 
 from petsc_fs.errors import UsageError
-from petsc_fs.forcing import EisenstatWalker, EisenstatWalkerParameters
+from petsc_fs.porepy.forcing import EisenstatWalker, EisenstatWalkerParameters
 
 
 def terms(residuals, tolerance=None, **parameters):

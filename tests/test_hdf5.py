@@ -11,8 +11,8 @@ import pytest
 from mpi4py import MPI
 from sample import SCENES, assert_same, full_scene
 
-from petsc_fs import hdf5
 from petsc_fs.errors import LayoutError, SceneError, UsageError
+from petsc_fs.io import hdf5
 from petsc_fs.layout import Layout
 from petsc_fs.scene import Scene
 

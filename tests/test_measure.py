@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from petsc_fs import accuracy, hdf5, reference
 from petsc_fs.errors import LayoutError, SceneError, SolveError
-from petsc_fs.measure import KINDS, Job, measure
+from petsc_fs.io import hdf5
 from petsc_fs.scene import Scene
+from petsc_fs.tools import accuracy, reference
+from petsc_fs.tools.measure import KINDS, Job, measure
 from tests.sample import SCENES, csr, dense
 
 BIOT = str(SCENES / "biot.h5")
@@ -319,7 +320,7 @@ def test_hang_is_ended_with_all_its_ranks(bad_pc: str) -> None:
     assert "4 s" in found["message"]
     assert time.monotonic() - started < 30
     commands = [path.read_bytes() for path in Path("/proc").glob("[0-9]*/cmdline") if readable(path)]
-    assert not any(b"petsc_fs.probe" in c and str(os.getpid()).encode() in c for c in commands)
+    assert not any(b"petsc_fs.tools.probe" in c and str(os.getpid()).encode() in c for c in commands)
 
 
 def readable(path: Path) -> bool:

@@ -12,8 +12,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from sample import SCENES, full_scene
 
-from petsc_fs import hdf5, memory, options
+from petsc_fs import memory, options
 from petsc_fs import scene as scene_module
+from petsc_fs.io import hdf5
 from petsc_fs.layout import Layout
 from petsc_fs.scene import CSR, Scene
 from petsc_fs.solver import Solver

@@ -7,8 +7,9 @@ import pytest
 from petsc4py import PETSc
 from sample import SCENES
 
-from petsc_fs import hdf5, options
+from petsc_fs import options
 from petsc_fs.errors import UsageError
+from petsc_fs.io import hdf5
 
 SHIPPED = sorted(p.name for p in options.shipped_folder().glob("*.opts"))
 

@@ -7,7 +7,8 @@ from mpi4py import MPI
 from test_solver import database  # noqa: F401
 
 import petsc_fs
-from petsc_fs import hdf5, options
+from petsc_fs import options
+from petsc_fs.io import hdf5
 from petsc_fs.solver import Solver
 
 pytestmark = pytest.mark.mpi

@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 from mpi4py import MPI
 from sample import CELLS, SCENES, full_scene
 
-from petsc_fs import hdf5, options
-from petsc_fs.distributed_reader import read_distributed
+from petsc_fs import options
 from petsc_fs.errors import LayoutError, SceneError, UsageError
 from petsc_fs.fields import FIELD
+from petsc_fs.io import hdf5
+from petsc_fs.io.reader import read_distributed
 from petsc_fs.layout import Layout, rows_of
 from petsc_fs.partition import (
     KINDS,

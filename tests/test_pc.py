@@ -10,9 +10,9 @@ from petsc4py import PETSc
 from test_solver import database  # noqa: F401
 
 import petsc_fs
-from petsc_fs import hdf5
 from petsc_fs.dm import field_dm, rigid_body_modes
 from petsc_fs.errors import SceneError, UsageError
+from petsc_fs.io import hdf5
 from petsc_fs.layout import Layout
 from petsc_fs.pc import ContactTransform, FixedStress
 from petsc_fs.pc.fixed_stress import algebraic_diagonal

@@ -11,8 +11,8 @@ import pytest
 from petsc4py import PETSc
 from sample import SCENES, assert_same, dense, full_scene
 
-from petsc_fs import hdf5, petsc_binary
 from petsc_fs.errors import LayoutError, SceneError, UsageError
+from petsc_fs.io import hdf5, petsc_binary
 
 BUNDLED = sorted(p.stem for p in SCENES.glob("*.h5") if p.stem != "model3")
 FILES = ("matrix.petsc", "rhs.petsc", "reference.petsc", "fields/mass.petsc")

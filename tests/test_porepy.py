@@ -454,7 +454,7 @@ def test_steps_that_cannot_be_read(text):
 
 
 def test_export_writes_the_steps(pp, tmp_path):
-    from petsc_fs.hdf5 import read
+    from petsc_fs.io.hdf5 import read
 
     lines = []
     paths = export("model1", 1, tmp_path / "new", steps="1:0,1:2,mixed", reference=True, progress=lines.append)
@@ -471,7 +471,7 @@ def test_export_writes_the_steps(pp, tmp_path):
 def test_bundled_scenes(name):
     """They have what they are there for: all contact states, and an accurate reference."""
     pytest.importorskip("scipy")
-    from petsc_fs.hdf5 import read
+    from petsc_fs.io.hdf5 import read
 
     scene = read(Path(petsc_fs.__path__[0]) / "scenes" / f"{name}.h5")
     assert scene.fields == FIELDS[name]

@@ -9,14 +9,14 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petsc_fs import options
-from petsc_fs.cli import tree_for
+from petsc_fs.cli.main import tree_for
 from petsc_fs.diagnostics import explain_weakness, transformed_contact_block
 from petsc_fs.errors import SceneError, UsageError
 from petsc_fs.layout import Layout
 from petsc_fs.scene import CONTACT_STATES, CSR, Scene, diagonal_blocks
 from petsc_fs.solver import Solver
-from petsc_fs.stress_cases import load, with_block_of_cell
 from petsc_fs.system import System
+from petsc_fs.tools.stress_cases import load, with_block_of_cell
 
 comm = MPI.COMM_WORLD
 FAST = "contact_poromechanics_fast.opts"

@@ -9,8 +9,8 @@ from mpi4py import MPI
 from test_solver import database  # noqa: F401
 
 import petsc_fs
-from petsc_fs import hdf5, sequence
 from petsc_fs.errors import UsageError
+from petsc_fs.io import hdf5, sequence
 from petsc_fs.reuse import Reuse, Triggers
 from petsc_fs.scene import Scene
 from petsc_fs.solver import Solver

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 import petsc_fs
-from petsc_fs import cli, sequence
+from petsc_fs.cli import main as cli
+from petsc_fs.io import sequence
 from petsc_fs.porepy.cases import CASES
 from petsc_fs.porepy.observation import PHASES
 from petsc_fs.porepy.simulation import PICTURE, RECORDS, SEQUENCE, SUMMARY, VTU

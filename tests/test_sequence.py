@@ -11,12 +11,14 @@ import pytest
 from mpi4py import MPI
 from sample import CELLS, SCENES, assert_same, full_scene
 
-from petsc_fs import cli, hdf5, sequence, tree
+from petsc_fs import tree
+from petsc_fs.cli import main as cli
+from petsc_fs.cli.replay import Player
 from petsc_fs.errors import SceneError, UsageError
+from petsc_fs.io import hdf5, sequence
+from petsc_fs.io.sequence import Writer
 from petsc_fs.layout import Layout
-from petsc_fs.replay import Player
 from petsc_fs.scene import CSR, Metadata
-from petsc_fs.sequence import Writer
 
 BUNDLED = SCENES.parent / "sequences" / "model2_run.h5"
 

@@ -9,12 +9,14 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import petsc_fs
-from petsc_fs import hdf5, options, stress_cases
+from petsc_fs import options
 from petsc_fs.errors import SolveError, UsageError
+from petsc_fs.io import hdf5
 from petsc_fs.layout import Layout
 from petsc_fs.scene import CSR, Scene
 from petsc_fs.solver import Solver
 from petsc_fs.system import PatternChanged, System
+from petsc_fs.tools import stress_cases
 
 pytestmark = pytest.mark.mpi
 comm = MPI.COMM_WORLD

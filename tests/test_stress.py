@@ -12,15 +12,18 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from sample import CELLS, full_scene
 
-from petsc_fs import cli, hdf5, options, reference, stress
-from petsc_fs.cli import tree_for
-from petsc_fs.conditioning import field_conditions, fieldwise_backward_error, magnitudes
+from petsc_fs import options
+from petsc_fs.cli import main as cli
+from petsc_fs.cli.main import tree_for
 from petsc_fs.errors import SceneError
 from petsc_fs.fallback import RUNGS
 from petsc_fs.fixed_stress import analytic_coefficients
-from petsc_fs.measure import EMPTY
+from petsc_fs.io import hdf5
 from petsc_fs.solver import Solver
-from petsc_fs.stress_cases import (
+from petsc_fs.tools import reference, stress
+from petsc_fs.tools.conditioning import field_conditions, fieldwise_backward_error, magnitudes
+from petsc_fs.tools.measure import EMPTY
+from petsc_fs.tools.stress_cases import (
     RECIPES,
     catalogue,
     in_units,
@@ -30,9 +33,9 @@ from petsc_fs.stress_cases import (
     with_block_of_cell,
     with_rhs,
 )
-from petsc_fs.stress_held_out import HELD_OUT, held_out
-from petsc_fs.stress_limits import AXES, write_limits
-from petsc_fs.stress_repairs import LADDER, REPAIRS, label, variants
+from petsc_fs.tools.stress_held_out import HELD_OUT, held_out
+from petsc_fs.tools.stress_limits import AXES, write_limits
+from petsc_fs.tools.stress_repairs import LADDER, REPAIRS, label, variants
 
 CASES = {case.name: case for case in catalogue()}
 UNIT_SYSTEMS = ({}, {"m": 1e-3}, {"s": 3600.0}, {"kg": 1e10, "m": 1e-3, "s": 3600.0})
@@ -277,7 +280,7 @@ def test_reports_are_merged_the_later_one_wins(tmp_path):
 
 
 def test_limits_say_how_far_a_file_is_right_on_all_ranks(tmp_path, monkeypatch):
-    monkeypatch.setattr("petsc_fs.stress_limits.RARE", 1)
+    monkeypatch.setattr("petsc_fs.tools.stress_limits.RARE", 1)
     outcomes = {"friction_0": "refusal", "friction_0.01": "right", "friction_0.1": "right", "friction_1.5": "right"}
     found = [finding(c, "a.opts", o) for c, o in outcomes.items()] + [finding("friction_1.5", "a.opts", "refusal", 2)]
     write_limits(stress.report([truth(name=c) for c in outcomes], found, "x"), tmp_path / "l.md")

@@ -15,15 +15,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from petsc_fs import measure, options, space
-from petsc_fs.cli import main
+from petsc_fs import options
+from petsc_fs.cli.main import main
 from petsc_fs.errors import SolveError, UsageError
+from petsc_fs.tools import measure, space
 from tests.sample import SCENES
 
 pytest.importorskip("yaml")
 optuna = pytest.importorskip("optuna")
-from petsc_fs.sweep import Settings, Sweep, aggregate, front, judge  # noqa: E402
-from petsc_fs.sweep_report import write  # noqa: E402
+from petsc_fs.tools.sweep import Settings, Sweep, aggregate, front, judge  # noqa: E402
+from petsc_fs.tools.sweep_report import write  # noqa: E402
 
 FLOW = SCENES / "flow.h5"
 HERE = Path(__file__).parent
@@ -391,7 +392,7 @@ def test_front_and_judgement() -> None:
 KILLED = """\
 import sys, time
 from pathlib import Path
-from petsc_fs import measure, sweep
+from petsc_fs.tools import measure, sweep
 from tests.test_sweep import by_restart, options, settings
 
 def slow(job, *, mpiexec=None):

@@ -16,12 +16,13 @@ from test_pc import dense, gathered, local_order, python_pc, system_of
 from test_solver import load, unequal
 
 import petsc_fs
-from petsc_fs import options, stress_cases
+from petsc_fs import options
 from petsc_fs.errors import SceneError, UsageError
 from petsc_fs.fields import FIELD_NAMES
 from petsc_fs.layout import Layout
 from petsc_fs.scene import CSR, Scene
 from petsc_fs.solver import Result, Solver
+from petsc_fs.tools import stress_cases
 from petsc_fs.tree import Facts, Tree, canonical_name, smallest_tree
 
 comm = MPI.COMM_WORLD
@@ -486,7 +487,9 @@ def test_option_of_a_level_left_out_is_named_with_the_reason(tmp_path, name, opt
 
 
 def test_flow_alone_imports_only_what_it_uses(tmp_path):
-    program = "import sys, petsc_fs.cli; print(petsc_fs.cli.main(['solve', 'flow.h5'])); print(*sorted(sys.modules))"
+    program = (
+        "import sys, petsc_fs.cli; print(petsc_fs.cli.main.main(['solve', 'flow.h5'])); print(*sorted(sys.modules))"
+    )
     done = subprocess.run(
         [sys.executable, "-c", program],
         cwd=tmp_path,
@@ -500,5 +503,5 @@ def test_flow_alone_imports_only_what_it_uses(tmp_path):
     assert code == "0", done.stderr
     imported = set(names.split())
     assert not imported & {"porepy", "matplotlib", "optuna", "scipy", "yaml"}
-    assert not {m for m in imported if m.startswith(("petsc_fs.pc", "petsc_fs.lint", "petsc_fs.plot"))}
+    assert not {m for m in imported if m.startswith(("petsc_fs.pc", "petsc_fs.cli.lint", "petsc_fs.tools.plots"))}
     assert "petsc_fs.tree" in imported

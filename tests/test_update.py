@@ -9,7 +9,7 @@ from mpi4py import MPI
 from programs import Program
 
 import petsc_fs
-from petsc_fs import hdf5
+from petsc_fs.io import hdf5
 from petsc_fs.layout import Layout
 from petsc_fs.scene import CSR, Scene
 from petsc_fs.system import PatternChanged, System
@@ -108,7 +108,8 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 import petsc_fs
-from petsc_fs import hdf5, options
+from petsc_fs import options
+from petsc_fs.io import hdf5
 from petsc_fs.layout import Layout
 from petsc_fs.scene import CSR
 from petsc_fs.solver import Solver

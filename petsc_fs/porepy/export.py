@@ -147,7 +147,7 @@ class _Recorder:
             raise UsageError("steps: no Newton step of the run has sticking, sliding and open cells at once")
 
     def _write(self, scene: Scene, solution: Floats | None) -> None:
-        from petsc_fs import hdf5
+        from petsc_fs.io import hdf5
 
         path = self.path(scene.metadata.time_step_index, scene.metadata.newton_index)
         if path in self.written:
@@ -233,7 +233,7 @@ def export_sequence(
     solver: str = "direct",
     progress: Progress | None = None,
 ) -> Path:
-    """Run a model and write the linear system of every Newton step into one file, see `petsc_fs.sequence`.
+    """Run a model and write the linear system of every Newton step into one file, see `petsc_fs.io.sequence`.
 
     A run that fails or is interrupted leaves the steps so far in an incomplete sequence beside the path.
 
@@ -248,7 +248,7 @@ def export_sequence(
     Raises:
         PetscFsError: see `export`.
     """
-    from petsc_fs import sequence
+    from petsc_fs.io import sequence
 
     model, solve = _prepare(model_name, parameters or ModelParameters(), solver)
     target = Path(path)

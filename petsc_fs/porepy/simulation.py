@@ -22,9 +22,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from petsc_fs import cli, options
+from petsc_fs import options
+from petsc_fs.cli import main as cli
 from petsc_fs.errors import PetscFsError, SolveError, UsageError, together
-from petsc_fs.files import write_text
+from petsc_fs.io.files import write_text
 from petsc_fs.porepy import require_porepy
 from petsc_fs.porepy.cases import CASES, ModelParameters
 from petsc_fs.porepy.export import add_model_arguments, parameters_of, run_attributes
@@ -33,7 +34,7 @@ from petsc_fs.porepy.observation import PHASES, Observed, Observer
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from petsc_fs.sequence import Writer
+    from petsc_fs.io.sequence import Writer
 
 Floats = NDArray[np.float64]
 
@@ -112,7 +113,7 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
                     client.stop()
         _raise_together(error, comm)
     if outcome is not None:
-        from petsc_fs.tables import run_table
+        from petsc_fs.cli.tables import run_table
 
         print(run_table(outcome), flush=True)
     return 0
@@ -219,7 +220,7 @@ class _Run:
         if self.given.file is not None:
             self.model.params["petsc_fs_options_file"] = str(self.given.file)
         if self.args.sequence:
-            from petsc_fs import sequence
+            from petsc_fs.io import sequence
 
             self.writer = sequence.Writer(self.folder / SEQUENCE, model=self.name)
         self.display.begin(_expected_time_steps(self.model, self.args.time_steps))
@@ -270,7 +271,7 @@ class _Run:
 
     def _draw(self) -> None:
         """Draw the contact states so far, if there are any."""
-        from petsc_fs.plot import plot_contact_states
+        from petsc_fs.tools.plots import plot_contact_states
 
         self._drawn = time.monotonic()
         if self.args.picture == "none" or self.notes or not any(r["contact_states"] for r in self.observer.records):

@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 from petsc_fs import options, server
 from petsc_fs.errors import SceneError, SolveError, UsageError
 from petsc_fs.fields import in_order
-from petsc_fs.forcing import EisenstatWalker, EisenstatWalkerParameters
 from petsc_fs.memory import return_freed
+from petsc_fs.porepy.forcing import EisenstatWalker, EisenstatWalkerParameters
 from petsc_fs.scene import Scene, contact_state_counts
 from petsc_fs.tree import Facts, Tree, shipped_tree
 
@@ -159,9 +159,9 @@ class FieldSplitSolver:
             fit into memory. retry solves again by another options file, and raises if that fails too.
         -petsc_fs_retry_file FILE: for retry, default retry.opts; its options get the prefix retry_.
         -petsc_fs_forcing fixed|eisenstat_walker: solve to -ksp_rtol, or each system only as far as Newton makes use
-            of it, but never further than to -ksp_rtol; see `petsc_fs.forcing.EisenstatWalker`. Residuals are
+            of it, but never further than to -ksp_rtol; see `petsc_fs.porepy.forcing.EisenstatWalker`. Residuals are
             measured as Newton does, by the model's `compute_residual_norm`.
-        -petsc_fs_ew_rtol0, _rtolmax, _gamma, _alpha, _threshold: see `petsc_fs.forcing.EisenstatWalkerParameters`.
+        -petsc_fs_ew_rtol0, _rtolmax, _gamma, _alpha, _threshold: see `petsc_fs.porepy.forcing.EisenstatWalkerParameters`.
 
     Attributes:
         linear_solves: one record per solve, in the order of solving.

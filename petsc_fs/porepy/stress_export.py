@@ -1,5 +1,5 @@
 # mypy: disallow-subclassing-any=False
-"""The scenes of `petsc_fs.stress_cases.RECIPES`, made by PorePy, in one file that keeps equal arrays once."""
+"""The scenes of `petsc_fs.tools.stress_cases.RECIPES`, made by PorePy, in one file that keeps equal arrays once."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from typing import Any
 import h5py
 import numpy as np
 
-from petsc_fs import hdf5
 from petsc_fs.errors import PetscFsError, UsageError
-from petsc_fs.files import complete
+from petsc_fs.io import hdf5
+from petsc_fs.io.files import complete
 from petsc_fs.porepy.cases import CASES, SIDE, ModelParameters, Rock
 from petsc_fs.scene import Scene, contact_state_counts
-from petsc_fs.stress_cases import RECIPES, Recipe
-from petsc_fs.stress_held_out import HELD_OUT
+from petsc_fs.tools.stress_cases import RECIPES, Recipe
+from petsc_fs.tools.stress_held_out import HELD_OUT
 
 Progress = Callable[[str], None]
 SEED = 7

@@ -1,0 +1,1 @@
+"""Files: scenes, sequences and PETSc's binary format."""

@@ -1,0 +1,1 @@
+"""What users do with solvers: compare, search, stress and look at them."""
