@@ -11,7 +11,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 
-
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from petsc_fs.partition import Layout, chosen, partition
 from petsc_fs.petsc_errors import brief, reason_name, translate
 from petsc_fs.result import Result
 from petsc_fs.scene import Scene
+from petsc_fs.singular import attach, describe, null_vectors
 from petsc_fs.system import EPS, FieldArrays, System, norm
 
 __all__ = ["Result", "Solver"]
@@ -94,7 +94,7 @@ class Solver:
         self.left_out = self._chosen.left_out
         self._retry: _Retry | None = None
         with self._options():
-            self.system = System(self.layout, root_only=root_only, coordinates=needs_coordinates(prefix))
+            self.system = System(self.layout, root_only=root_only, near_null_space=needs_near_null_space(prefix))
             self.system.take(self._scene, release=release)
             self._forget_blocks()
             self.ksp = self._make_ksp(prefix)
@@ -214,6 +214,8 @@ class Solver:
         self.set_up()
         with self._options():
             result = self._run(self.ksp, wanted)
+            if not result.converged:
+                result = self._look_for_null_vectors(result, wanted)
         retry = PETSc.Options(self.prefix).getString("petsc_fs_retry", "none")
         if not result.converged and retry != "none":
             result = self._solve_again(retry, wanted, result)
@@ -253,6 +255,21 @@ class Solver:
             solve_seconds=time.perf_counter() - started,
             solution=solution,
             notes=run.notes,
+        )
+
+    def _look_for_null_vectors(self, result: Result, wanted: float) -> Result:
+        """Where a solve has failed because the system is singular, say so, and solve without its null space. Collective."""
+        vectors = null_vectors(self.system)
+        if not vectors:
+            return result
+        note = describe(self.system, vectors)
+        attach(self.system, self._matrix, vectors)
+        again = self._run(self.ksp, wanted)
+        return replace(
+            again,
+            iterations=result.iterations + again.iterations,
+            solve_seconds=result.solve_seconds + again.solve_seconds,
+            notes=(note + (". Solved for the solution without it" if again.converged else ""), *again.notes),
         )
 
     def _errors(self, solution: FieldArrays) -> dict[str, float]:
@@ -390,7 +407,7 @@ class _Run:
         """
         if self.missing > 1.0 or not self.passes:
             return
-        least, doubtful = self._least_singular_value(), self.system.has_weak_pivots()
+        least, doubtful = self._least_singular_value(), False
         for _ in range(MOST_IMPROVEMENTS):
             self._precondition()
             steps, eta = self._relative(self.d), max(self.check.backward.values())
@@ -432,6 +449,13 @@ class _Run:
             self.ksp.getPC().apply(self.r, self.d)
         except (PETSc.Error, ImportError) as e:
             raise translate(e, "the preconditioner failed") from None
+        self._leave_null_space()
+
+    def _leave_null_space(self) -> None:
+        """Take out of `d` what the matrix maps to zero, where that is known. Collective."""
+        space = self.ksp.getOperators()[0].getNullSpace()
+        if space:
+            space.remove(self.d)
 
     def _measured(self) -> dict[str, float] | None:
         """Relative size of what a residual of this size may be worth; None if that cannot be solved for. Collective."""
@@ -462,6 +486,7 @@ class _Run:
             ksp.solve(self.r, self.d)
         except (PETSc.Error, ImportError) as e:
             raise translate(e, "solve failed") from None
+        self._leave_null_space()
         self.passes += 1
         self.iterations += ksp.getIterationNumber()
         self.history.append(np.array(ksp.getConvergenceHistory()))
@@ -543,7 +568,7 @@ def _set_up(ksp: PETSc.KSP) -> None:
         raise translate(e, "set-up failed") from None
 
 
-def needs_coordinates(prefix: str) -> bool:
+def needs_near_null_space(prefix: str) -> bool:
     """Whether the solver in the options database makes use of rigid-body modes. Local."""
     chosen = {k: str(v) for k, v in PETSc.Options().getAll().items() if k.startswith(prefix)}
     types = {v for k, v in chosen.items() if k.endswith("pc_type")}
