@@ -14,7 +14,6 @@ from petsc4py import PETSc
 
 from petsc_fs.dm import Blocks, Problem, field_dm, field_nest, merge_mechanics, one_matrix
 from petsc_fs.errors import LayoutError, SceneError, together
-from petsc_fs.fixed_stress import analytic_coefficients
 from petsc_fs.layout import Layout
 from petsc_fs.scene import CSR, SLAB, Integers, Scene, increasing, slabs
 
@@ -72,7 +71,7 @@ class System:
         with together(layout.comm):
             self._check(scene)
             self._fixed_stress = fixed_stress and "mass" in fields
-            coefficients = analytic_coefficients(scene) if self._fixed_stress else None
+            coefficients = scene.fixed_stress_coefficients() if self._fixed_stress else None
         pairs = list(product(fields, fields))
         entries = np.array([scene.blocks[rc].data.size if rc in scene.blocks else 0 for rc in pairs])
         entries = layout.comm.allreduce(entries)
@@ -113,7 +112,7 @@ class System:
         with together(self.layout.comm):
             self._check(scene)
             if self._fixed_stress:
-                self.problem.fixed_stress = analytic_coefficients(scene)
+                self.problem.fixed_stress = scene.fixed_stress_coefficients()
             for rc, block in scene.blocks.items():
                 if block.data.size and rc not in self.blocks:
                     raise PatternChanged(f"block {rc} was empty")

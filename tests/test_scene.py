@@ -283,7 +283,7 @@ INVALID = {
     "cell_dimension_length": (lambda: replace(PLAIN, cell_dimension=np.zeros(5)), r"cell_dimension has shape \(5,\)"),
     "material_length": (
         lambda: replace(PLAIN, material=replace(PLAIN.material, porosity=np.ones(7))),
-        r"mass: porosity has shape \(7,\), expected \(6,\)",
+        r"material: porosity has shape \(7,\), expected \(6,\)",
     ),
 }
 

@@ -21,7 +21,7 @@ class FixedStress(WrapperPC):
     The operator has the field `mass`, alone or beside others, as a MatNest or as one AIJ.
 
     Options, with the prefix of this PC:
-        -fs_type analytic: D_55 from material data, see `petsc_fs.fixed_stress.analytic_coefficients`
+        -fs_type analytic: D_55 from material data, see `petsc_fs.scene.Scene.fixed_stress_coefficients`
             (paper, eq:fixed_stress_coefs); the default where the scene has the data.
         -fs_type algebraic: D_55 from the matrix alone, for scenes without material data; needs the
             blocks of mechanics, see `algebraic_diagonal`.
