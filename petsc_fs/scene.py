@@ -539,7 +539,7 @@ def _inverse(ids: Mapping[str, Integers], n: int, what: str) -> tuple[Integers, 
     local: Integers = np.zeros(n, dtype=np.int32 if n < 2**31 else np.int64)
     for k, (name, index) in enumerate(ids.items()):
         if index.size and not (0 <= index.min() and index.max() < n):
-            raise LayoutError(f"{name}: a {what} number is outside 0:{n}")
+            raise LayoutError(f"{name}: a {what} number is outside 0:{n}; they begin at 0")
         if (owner[index] >= 0).any() or np.unique(index).size != index.size:
             raise LayoutError(f"{name}: a {what} is listed twice or belongs to two fields")
         owner[index] = k

@@ -166,11 +166,10 @@ class _File:
             raise SceneError(f"{self.path}: {CUT} for {count} numbers and {8 * self.integer.itemsize}-bit integers")
         if width == 16:
             raise SceneError(
-                f"{self.path}: numbers of 16 bytes, as a PETSc for complex scalars writes them; a scene is real: write it "
-                "by a PETSc for real scalars"
+                f"{self.path}: numbers of 16 bytes, as a PETSc for complex scalars writes them; a scene is real: write "
+                "it by a PETSc for real scalars"
             )
-        number = np.dtype(NUMBERS[width]).newbyteorder(self.integer.byteorder)
-        return np.frombuffer(self.raw, number, count, self.at).astype(np.float64)
+        return np.frombuffer(self.raw, self.integer.str[0] + NUMBERS[width], count, self.at).astype(np.float64)
 
     def matrix(self) -> tuple[Any, int, int]:
         """Compressed rows or a dense array; number of rows and of columns."""
