@@ -230,11 +230,14 @@ def cut_rows(matrix: CSR, rows: Integers, owner: Integers, local: Integers, part
     full = np.cumsum(matrix.indptr[rows + 1] - matrix.indptr[rows]) // SLAB
     found: list[list[CSR]] = [[] for _ in range(parts)]
     for piece in np.split(rows, np.flatnonzero(np.diff(full)) + 1):
+        take: Any
         take, counts = gather_rows(matrix.indptr, piece)
+        if take.size and take[-1] - take[0] == take.size - 1 and (np.diff(piece) == 1).all():
+            take = slice(take[0], take[-1] + 1)  # rows that follow each other: without a copy
         columns, data = matrix.indices[take], matrix.data[take]
         row_of, owners = np.repeat(np.arange(piece.size), counts), owner[columns]
         for k, blocks in enumerate(found):
-            mine = owners == k
+            mine = np.flatnonzero(owners == k)
             blocks.append(_sorted_rows(row_of[mine], local[columns[mine]], data[mine], piece.size))
     return [_stack(blocks) for blocks in found]
 
@@ -245,9 +248,10 @@ def _sorted_rows(rows: Integers, columns: Integers, data: Floats, n: int) -> CSR
     if (place[1:] < place[:-1]).any():
         order = np.argsort(place, kind="stable")  # which is fast where most of it is in order, as here
         columns, data, place = columns[order], data[order], place[order]
-    fresh = np.concatenate([[True], place[1:] != place[:-1]]) if place.size else np.ones(0, dtype=bool)
-    if not fresh.all():
-        rows, columns, data = rows[fresh], columns[fresh], np.add.reduceat(data, np.flatnonzero(fresh))
+    again = place[1:] == place[:-1]
+    if again.any():
+        first = np.flatnonzero(np.concatenate([[True], ~again]))
+        rows, columns, data = rows[first], columns[first], np.add.reduceat(data, first)
     return CSR(np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))]), columns, data)
 
 

@@ -431,7 +431,8 @@ class Scene:
         if self.rows is not None:
             raise LayoutError("restrict: the scene is already the part of one rank")
         own, places = {}, {}
-        rows = dict(where) if isinstance(where, Mapping) else {f: where.rows(f) for f in where.fields}
+        found = where if isinstance(where, Mapping) else {f: where.rows(f) for f in where.fields}
+        rows = {f: (int(a), int(b)) for f, (a, b) in found.items()}
         for name, size in self.sizes.items():
             if name not in rows or not 0 <= rows[name][0] <= rows[name][1] <= size:
                 raise LayoutError(f"{name}: row range {rows.get(name)} is not inside 0:{size}")
@@ -467,7 +468,7 @@ class Scene:
             contact_state=of_cells(self.contact_state, "contact"),
             material=material,
             metadata=self.metadata,
-            rows={f: (int(a), int(b)) for f, (a, b) in rows.items()},
+            rows=rows,
             cells={f: own[f] for f in places},
         )
         part.validate()
@@ -523,6 +524,7 @@ def _numbers(spec: Any, n: int, what: str) -> Integers:
 
 
 def _check_array(what: str, values: NDArray[Any], shape: tuple[int, ...]) -> None:
+    shape = tuple(map(int, shape))  # integers of numpy are printed otherwise
     if values.shape != shape:
         raise LayoutError(f"{what} has shape {values.shape}, expected {shape}")
     if not np.isfinite(values).all():

@@ -85,7 +85,7 @@ class Damage:
     """One thing that is wrong with a scene's file.
 
     Attributes:
-        kind: "array", "block", "attribute", "lost", "link", "bits", "cut" or "none".
+        kind: "array", "block", "attribute", "lost", "link", "hidden", "bits", "cut" or "none".
         place: which dataset, group or byte, as a fraction of all.
         way: what is done to it.
         at: which entry of it, as a fraction.
@@ -137,6 +137,9 @@ kinds = {
         Damage, st.just("lost"), fractions, st.sampled_from(("dataset", "group", "attribute")), fractions
     ),
     "link": st.builds(Damage, st.just("link"), fractions, st.sampled_from(("outside", "itself", "other"))),
+    "hidden": st.builds(
+        Damage, st.just("hidden"), fractions, st.sampled_from(("virtual", "external", "unwritten", "half"))
+    ),
     "bits": st.builds(Damage, st.just("bits"), fractions, st.integers(0, 7)),
     "cut": st.builds(Damage, st.just("cut"), fractions, st.integers(0, 2)),
 }
@@ -221,7 +224,7 @@ def hurt(path: Path, damage: Damage) -> None:
         hurt_inside(file, damage)
 
 
-def hurt_inside(file: h5py.File, damage: Damage) -> None:
+def hurt_inside(file: h5py.File, damage: Damage) -> None:  # noqa: PLR0911
     """Do one thing to what a scene's file holds."""
     kind, way = damage.kind, damage.way
     if kind == "block":
@@ -250,11 +253,29 @@ def hurt_inside(file: h5py.File, damage: Damage) -> None:
         del file[name]
         file[name] = twisted
         return None
+    if kind == "hidden":
+        return hide(file, name, way)
     del file[name]
     if kind == "link":
         links = {"outside": h5py.ExternalLink("nowhere.h5", "x"), "itself": h5py.SoftLink("/" + name)}
         file[name] = links.get(way, h5py.SoftLink("/" + pick(names, damage.at)))
     return None
+
+
+def hide(file: h5py.File, name: str, way: str) -> None:
+    """Put the numbers of a dataset into a file that is not there, or do not write all of them."""
+    values = np.array(file[name][()])
+    del file[name]
+    if way == "virtual":
+        layout = h5py.VirtualLayout(values.shape, values.dtype)
+        layout[...] = h5py.VirtualSource("nowhere.h5", "x", values.shape)
+        file.create_virtual_dataset(name, layout)
+    elif way == "external":
+        file.create_dataset(name, values.shape, values.dtype, external=[("nowhere.raw", 0, values.nbytes)])
+    else:
+        dataset = file.create_dataset(name, values.shape, values.dtype, chunks=(1,) * values.ndim)
+        if way == "half":
+            dataset[: len(values) // 2] = values[: len(values) // 2]
 
 
 def hurt_block(file: h5py.File, damage: Damage) -> None:

@@ -1,5 +1,7 @@
 """Scenes: cutting a matrix into blocks and back, what does not fit together, parts of one rank."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -550,3 +552,18 @@ def test_a_part_cannot_be_cut_again():
 
 def test_contact_states_are_counted_by_name():
     assert contact_state_counts([2, 0, 0, 2, 2]) == {"sticking": 2, "sliding": 0, "open": 3}
+
+
+def test_importing_the_package_initialises_nothing():
+    program = """
+import sys, petsc_fs
+assert petsc_fs.__version__
+assert not {"h5py", "numpy", "petsc4py", "petsc4py.PETSc", "mpi4py.MPI", "porepy"} & set(sys.modules)
+from petsc_fs import Scene, hdf5, options, sequence
+assert not {"petsc4py.PETSc", "porepy", "scipy"} & set(sys.modules)
+import petsc_fs.io.hdf5, petsc_fs.io.sequence, petsc_fs.scene, petsc_fs.solver
+assert (hdf5, sequence) == (petsc_fs.io.hdf5, petsc_fs.io.sequence)
+assert (Scene, petsc_fs.Solver) == (petsc_fs.scene.Scene, petsc_fs.solver.Solver)
+assert not hasattr(petsc_fs, "nothing")
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)

@@ -213,7 +213,10 @@ def read_group(
 ) -> Scene:
     """Read a scene, or the rows of one rank, from an open file or a group of one; see `read`."""
     found = parts(group)
-    ranges = {f: (0, n) for f, n in found.sizes.items()} if rows is None else dict(rows(found.dimension, found.sizes))
+    chosen = {f: (0, n) for f, n in found.sizes.items()} if rows is None else rows(found.dimension, found.sizes)
+    ranges = {f: (int(a), int(b)) for f, (a, b) in chosen.items()}
+    if rows is not None:
+        found.check_order()  # which a whole scene is asked for when it is there
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if rows is None and found.nbytes > memory:
         raise SceneError(f"takes {found.nbytes / 2**30:.0f} GiB, and this machine has {memory / 2**30:.0f} GiB")
@@ -379,15 +382,20 @@ def check_storage(group: h5py.Group, depth: int = 3) -> None:
         item = group[name]
         if isinstance(item, h5py.Group) and depth:
             check_storage(item, depth - 1)
-        if not isinstance(item, h5py.Dataset) or not item.size:
+        if not isinstance(item, h5py.Dataset) or not item.shape or 0 in item.shape:
             continue
-        if item.is_virtual or item.external:
+        made, size, stored = item.id.get_create_plist(), item.id.get_type().get_size(), item.id.get_storage_size()
+        if made.get_layout() == h5py.h5d.VIRTUAL or made.get_external_count():
             raise SceneError(f"{item.name} lies in other files; a scene is one file: h5repack -l CONTI writes one")
-        size, stored = item.id.get_type().get_size(), item.id.get_storage_size()
-        promised, there, needed = item.size * size, stored, item.size * size
-        if item.chunks:
-            needed = math.prod(-(-n // chunk) for n, chunk in zip(item.shape, item.chunks, strict=True))
-            promised, there = needed * math.prod(item.chunks) * size, item.id.get_num_chunks()
+        promised = needed = math.prod(item.shape) * size
+        there = stored
+        if made.get_layout() == h5py.h5d.CHUNKED:
+            chunk = made.get_chunk()
+            needed, there = (
+                math.prod(-(-n // c) for n, c in zip(item.shape, chunk, strict=True)),
+                item.id.get_num_chunks(),
+            )
+            promised = needed * math.prod(chunk) * size
         if there < needed:
             raise SceneError(f"{item.name} is not written in full, so that HDF5 would make it up; export it again")
         if stored > item.file.id.get_filesize() or promised > max(SMALL, DEFLATE * stored):
@@ -419,13 +427,23 @@ class Parts:
         material = [value for value in self.material.values() if not isinstance(value, float)]
         return sum(int(dataset.nbytes) for dataset in (*self.arrays.values(), *blocks, *material))
 
+    def check_order(self) -> None:
+        """Refuse fields that are numbered component by component; a few rows of their blocks are read.
+
+        Raises:
+            LayoutError: there is one.
+        """
+        for (r, c), block in self.blocks.items():
+            if r == c:
+                check_order(r, self.dimension, self.sizes[r], partial(_read_block, block, r, r))
+
 
 def parts(file: h5py.Group) -> Parts:
     """Find the parts of a scene, and check all that can be checked without reading them.
 
     Raises:
         SceneError: as `read_header`; a dataset is missing or of another kind.
-        LayoutError: a shape is wrong, or a field is numbered component by component.
+        LayoutError: a shape is wrong.
     """
     dimension, sizes = read_header(file)
     arrays: dict[tuple[str, str], h5py.Dataset] = {}
@@ -445,8 +463,6 @@ def parts(file: h5py.Group) -> Parts:
                 raise LayoutError(f"block ({r}, {c}): the scene has no field {r if r not in sizes else c!r}")
             check_block(block, f"block ({r}, {c})", (sizes[r], sizes[c]))
             blocks[r, c] = block
-            if r == c:
-                check_order(r, dimension, sizes[r], partial(_read_block, block, r, r))
     material: dict[str, h5py.Dataset | float] = {}
     if "material" in file and "mass" in sizes:
         group = file["material"]
