@@ -63,7 +63,9 @@ def write(scene: Scene, path: str | os.PathLike[str], *, compression: str | None
     scene.validate()
     if scene.cells or any(scene.row_range(f) != (0, n) for f, n in scene.sizes.items()):
         raise SceneError(f"{target}: only a whole scene can be written, this is the part of one rank")
-    return _write_file(target, lambda file: write_group(file, scene, dataset_creator(compression)))
+    with complete(target) as temporary, h5py.File(temporary, "w") as file:
+        write_group(file, scene, dataset_creator(compression))
+    return target
 
 
 def dataset_creator(compression: str | None) -> Callable[[h5py.Group, str, Any], object]:
@@ -76,14 +78,8 @@ def dataset_creator(compression: str | None) -> Callable[[h5py.Group, str, Any],
     return create
 
 
-def _write_file(target: Path, fill: Callable[[h5py.File], None]) -> Path:
-    with complete(target) as temporary, h5py.File(temporary, "w") as file:
-        fill(file)
-    return target
-
-
 def write_solution(solution: Mapping[str, Any], path: str | os.PathLike[str], scene: Scene) -> Path:
-    """Write a solution, one dataset per field in the scene's numbering and units.
+    """Write a solution, one dataset per field in the scene's numbering and units; see `write`.
 
     Args:
         solution: all rows of each field.
@@ -93,17 +89,15 @@ def write_solution(solution: Mapping[str, Any], path: str | os.PathLike[str], sc
     Raises:
         UsageError: the file cannot be written.
     """
-
-    def fill(file: h5py.File) -> None:
+    target = Path(path)
+    with complete(target) as temporary, h5py.File(temporary, "w") as file:
         file.attrs["encoding-type"] = "petsc_fs solution"
         file.attrs["encoding-version"] = VERSION
-        file.attrs["model"] = scene.metadata.model
-        file.attrs["time_step_index"] = scene.metadata.time_step_index
-        file.attrs["newton_index"] = scene.metadata.newton_index
+        for name in ("model", "time_step_index", "newton_index"):
+            file.attrs[name] = getattr(scene.metadata, name)
         for name, values in solution.items():
             file.create_dataset(name, data=values).attrs["unit"] = FIELD[name].unit
-
-    return _write_file(Path(path), fill)
+    return target
 
 
 def write_group(file: h5py.Group, scene: Scene, create: Callable[[h5py.Group, str, Any], object]) -> None:
@@ -136,9 +130,14 @@ def write_group(file: h5py.Group, scene: Scene, create: Callable[[h5py.Group, st
         group.attrs["size"] = scene.sizes[name]
         group.attrs["block_size"] = scene.block_size(name)
         group.attrs["unit"] = FIELD[name].unit
-        put(group, "rhs", scene.rhs[name])
-        for what, values in _known_arrays(scene, name).items():
-            put(group, what, values)
+        for what in (*PER_ROW, *PER_CELL):
+            values = getattr(scene, what)
+            if isinstance(values, dict):
+                values = values.get(name)
+            elif name != {"cell_dimension": "mass", "contact_state": "contact"}[what]:
+                continue
+            if values is not None:
+                put(group, what, values)
     file.create_group("blocks")
     for (r, c), block in scene.blocks.items():
         group = file.create_group(f"blocks/{r}/{c}")
@@ -154,18 +153,6 @@ def write_group(file: h5py.Group, scene: Scene, create: Callable[[h5py.Group, st
                 put(group, what, value)
             else:
                 group.attrs[what] = float(np.asarray(value))
-
-
-def _known_arrays(scene: Scene, name: str) -> dict[str, Any]:
-    """The optional arrays of a field that the scene has."""
-    found: dict[str, Any] = {
-        "reference": scene.reference.get(name),
-        "cell_centers": scene.cell_centers.get(name),
-        "cell_volumes": scene.cell_volumes.get(name),
-        "cell_dimension": scene.cell_dimension if name == "mass" else None,
-        "contact_state": scene.contact_state if name == "contact" else None,
-    }
-    return {k: v for k, v in found.items() if v is not None}
 
 
 def versions() -> dict[str, str]:

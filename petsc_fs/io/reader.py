@@ -6,7 +6,6 @@ import itertools
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import fields as attributes
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
 
 Context = AbstractContextManager[Any]
 Pair = tuple[str, str]
-PER_ROW = ("rhs", "reference")
 INTEGERS = ("cell_dimension", "contact_state")
 
 
@@ -108,52 +106,18 @@ class _Reader:
             explained: context that names the file in errors.
         """
         self.comm, self.index_type, self._explained = comm, index_type, explained
-        self.dimension, self.sizes = hdf5.read_header(file)
+        found = hdf5.parts(file)
+        found.check_order()
+        self.dimension, self.sizes, self.arrays, self.blocks = found.dimension, found.sizes, found.arrays, found.blocks
         self.cells = {f: n // FIELD[f].block_size(self.dimension) for f, n in self.sizes.items()}
         self.metadata = hdf5.read_metadata(file)
-        self.arrays: dict[Pair, h5py.Dataset] = {}
-        for f in self.sizes:
-            group = file["fields"][f]
-            for what in (*PER_ROW, *hdf5.PER_CELL):
-                if what in group:
-                    expected = self.sizes[f] if what in PER_ROW else self.cells[f]
-                    if group[what].shape[:1] != (expected,):
-                        raise LayoutError(f"{f}: {what} has {len(group[what])} entries, expected {expected}")
-                    if what in INTEGERS and group[what].dtype.kind not in "iuf":
-                        meaning = "0 (sticking), 1 (sliding) or 2 (open)" if what == "contact_state" else "integers"
-                        raise SceneError(f"the scene is damaged ({what}: expected {meaning})")
-                    if group[what].dtype.kind not in "biuf":
-                        raise SceneError(f"the scene is damaged ({f}: {what}: expected real numbers)")
-                    shape = (expected, 3) if what == "cell_centers" else (expected,)
-                    if group[what].shape != shape:
-                        raise LayoutError(f"{f}: {what} has shape {group[what].shape}, expected {shape}")
-                    self.arrays[f, what] = group[what]
-        self.blocks: dict[Pair, h5py.Group] = {}
-        for r, row in file["blocks"].items():
-            for c in row:
-                what = f"block ({r}, {c})"
-                if r not in self.sizes or c not in self.sizes:
-                    raise LayoutError(f"{what}: the scene has no field {r if r not in self.sizes else c!r}")
-                hdf5.check_block(row[c], what, (self.sizes[r], self.sizes[c]))
-                self.blocks[r, c] = row[c]
         if max(self.sizes.values(), default=0) > np.iinfo(index_type).max:
             raise SceneError(f"a field has more unknowns than {index_type} can number: use a PETSc with 64-bit indices")
-        self.material: dict[str, h5py.Dataset | float] = {}
-        self.time_step = 0.0
-        if "material" in file and "mass" in self.sizes:
-            self._find_material(file["material"])
+        self.material = dict(found.material)
+        self.time_step = self.material.pop("time_step", 0.0)
         self._shares: dict[str, tuple[int, NDArray[Any]]] = {}
         self.indptr: dict[Pair, Cells] = {}
         self.disordered: list[str] = []
-
-    def _find_material(self, group: h5py.Group) -> None:
-        names = [a.name for a in attributes(Material) if a.name != "time_step"]
-        for name in names:
-            self.material[name] = group[name] if name in group else float(group.attrs[name])
-        self.time_step = float(group.attrs["time_step"])
-        for name in group:
-            if group[name].shape != (self.sizes["mass"],):
-                raise LayoutError(f"material: {name} has shape {group[name].shape}, expected {(self.sizes['mass'],)}")
 
     def agree(self) -> None:
         """Make sure that all ranks see the same file. Collective."""
@@ -220,12 +184,12 @@ class _Reader:
             by_row[f] = Redistribution(
                 self.comm, np.arange(owners.size * bs + 1), np.repeat(owners, bs), rows_of(own, bs)
             )
-        found: dict[str, dict[str, Any]] = {what: {} for what in (*PER_ROW, *hdf5.PER_CELL)}
+        found: dict[str, dict[str, Any]] = {what: {} for what in (*hdf5.PER_ROW, *hdf5.PER_CELL)}
         material: dict[str, Any] = {}
         transfers = []
         for (f, what), dataset in self.arrays.items():
             number = dataset.dtype if what in INTEGERS else np.dtype(np.float64)
-            transfers.append(self._transfer(by_row[f] if what in PER_ROW else by_cell[f], dataset, number))
+            transfers.append(self._transfer(by_row[f] if what in hdf5.PER_ROW else by_cell[f], dataset, number))
             found[what][f] = transfers[-1].out
         for name, value in self.material.items():
             material[name] = value
