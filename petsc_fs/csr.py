@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ ALMOST_SINGULAR = 1e-14
 """Ratio of least to greatest singular value at which a small matrix counts as singular."""
 
 SLAB = 1 << 20
-"""Number of entries that are sorted or renumbered at a time, which bounds the memory it takes."""
+"""Number of entries that are sorted at a time, which bounds the memory it takes."""
 
 WINDOW, WINDOW_LEAST = 128, 12
 """Number of cells whose rows `by_component` looks at, and the least number of cells that say anything."""
@@ -37,32 +37,6 @@ def increasing(block: CSR) -> bool:
     ends = block.indptr[1:-1]
     falls[ends[(ends > 0) & (ends < block.indices.size)] - 1] = False
     return not falls.any()
-
-
-def renumber(block: CSR, places: Integers, block_size: int, out: CSR) -> None:
-    """Give columns other numbers and sort them again.
-
-    Args:
-        block: rows of a block.
-        places: (cells of the columns,) the new number of each cell.
-        block_size: unknowns per cell of the columns.
-        out: of the same rows; may be `block` itself.
-    """
-    numbers = rows_of(places, block_size)
-    for a, b, start, stop in slabs(block.indptr, SLAB):
-        columns = numbers[block.indices[start:stop]]
-        rows = np.repeat(np.arange(b - a), np.diff(block.indptr[a : b + 1]))
-        order = np.argsort(rows * (places.size * block_size) + columns, kind="stable")
-        out.indices[start:stop], out.data[start:stop] = columns[order], block.data[start:stop][order]
-
-
-def slabs(indptr: Integers, entries: int) -> Iterator[tuple[int, int, int, int]]:
-    """Groups of whole rows with about so many entries each: first and last row, first and last entry (half-open)."""
-    a, n = 0, indptr.size - 1
-    while a < n:
-        b = max(a + 1, int(np.searchsorted(indptr, int(indptr[a]) + entries, side="right")) - 1)
-        yield a, b, int(indptr[a]), int(indptr[b])
-        a = b
 
 
 def csr_rows(block: CSR, start: int, stop: int) -> CSR:
@@ -97,11 +71,6 @@ def singular(dense: Floats) -> NDArray[np.bool_]:
 def singular_diagonal_blocks(block: CSR, size: int) -> int:
     """Number of singular diagonal blocks of a square block, see `diagonal_blocks`."""
     return int(np.count_nonzero(singular(diagonal_blocks(block, size))))
-
-
-def rows_of(cells: Integers, block_size: int) -> Integers:
-    """All rows of the given cells, cell by cell."""
-    return np.asarray((cells[:, None] * block_size + np.arange(block_size)).ravel())
 
 
 def gather_rows(indptr: Integers, rows: Integers) -> tuple[Integers, Integers]:

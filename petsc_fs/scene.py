@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from petsc_fs.csr import (
     CSR,
-    SLAB,
     Floats,
     Integers,
     array_of,
@@ -24,23 +23,15 @@ from petsc_fs.csr import (
     gather_rows,
     increasing,
     real_numbers,
-    renumber,
-    rows_of,
-    singular,
     singular_diagonal_blocks,
-    slabs,
     whole_numbers,
 )
 from petsc_fs.errors import LayoutError, SceneError, UsageError
 from petsc_fs.fields import FIELD, FIELD_NAMES, in_order
 
-if TYPE_CHECKING:
-    from petsc_fs.layout import Layout
-
 __all__ = [
-    "CONTACT_STATES", "CSR", "SLAB", "Floats", "Integers", "Material", "Metadata", "Scene", "check_order",
-    "contact_state_counts", "diagonal_blocks", "gather_rows", "increasing", "renumber", "rows_of", "singular",
-    "singular_diagonal_blocks", "slabs",
+    "CONTACT_STATES", "CSR", "Floats", "Integers", "Material", "Metadata", "Scene", "check_order",
+    "contact_state_counts", "csr_rows", "diagonal_blocks", "gather_rows", "singular_diagonal_blocks",
 ]  # fmt: skip
 
 CONTACT_STATES = ("sticking", "sliding", "open")
@@ -105,7 +96,7 @@ class Scene:
 
     A scene holds all rows, or, where `rows` says so, those of one rank; then the arrays per row
     and per cell cover these rows only, while `sizes` and column numbers stay global. The part of one
-    rank is numbered, rows and columns, as the `petsc_fs.layout.Layout` that it was made for.
+    rank is numbered, rows and columns, as the `petsc_fs.partition.Layout` that it was made for.
 
     Attributes:
         dimension: of the rock matrix, D = 2 or 3.
@@ -120,8 +111,6 @@ class Scene:
         material: data of the fixed-stress diagonals, None if unknown.
         metadata: where the scene comes from.
         rows: per field the half-open range of rows held here; None if all.
-        cells: per field the numbers in the whole scene of the cells held here; missing where they are
-            the `rows`. Errors name rows and cells by these.
     """
 
     dimension: int
@@ -136,7 +125,6 @@ class Scene:
     material: Material | None = None
     metadata: Metadata = field(default_factory=Metadata)
     rows: dict[str, tuple[int, int]] | None = None
-    cells: dict[str, Integers] = field(default_factory=dict)
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -150,13 +138,6 @@ class Scene:
     def row_range(self, name: str) -> tuple[int, int]:
         """Half-open global range of the rows of a field that are held here."""
         return self.rows[name] if self.rows is not None else (0, self.sizes[name])
-
-    def row_name(self, name: str, row: int) -> int:
-        """Number in the whole scene of a row of a field, given its place among those held here."""
-        bs = self.block_size(name)
-        if name in self.cells:
-            return int(self.cells[name][row // bs]) * bs + row % bs
-        return self.row_range(name)[0] + row
 
     @classmethod
     def from_matrix(
@@ -290,7 +271,7 @@ class Scene:
         if not np.isfinite(block.data).all():
             at = np.flatnonzero(~np.isfinite(block.data))[0]
             row = int(np.searchsorted(block.indptr, at, side="right")) - 1
-            raise SceneError(f"{what}: row {self.row_name(r, row)} has an entry that is not finite (NaN or Inf)")
+            raise SceneError(f"{what}: row {start + row} has an entry that is not finite (NaN or Inf)")
         if r == c and self.rows is None:
             check_order(r, self.dimension, self.sizes[r], lambda start, stop: csr_rows(block, start, stop))
 
@@ -336,7 +317,7 @@ class Scene:
             for kind in ("equation", "unknown") if self.rows is None else ("equation",):
                 empty = np.flatnonzero(~found.get((kind, name), np.zeros(stop - start, dtype=bool)))
                 if empty.size:
-                    cell, component = divmod(self.row_name(name, int(empty[0])), self.block_size(name))
+                    cell, component = divmod(start + int(empty[0]), self.block_size(name))
                     which = f", component {'xyz'[component]}," if self.block_size(name) > 1 else ""
                     among = f" ({empty.size} such {kind}s)" if empty.size > 1 else ""
                     raise SceneError(
@@ -413,83 +394,52 @@ class Scene:
             contact_state=self.contact_state if "contact" in names else None,
             material=self.material if "mass" in names else None,
             rows=None if self.rows is None else part(self.rows),
-            cells=part(self.cells),
         )
 
-    def restrict(self, where: Layout | Mapping[str, tuple[int, int]]) -> Scene:
-        """The part of a whole scene that one rank holds, numbered as the layout.
+    def restrict(self, rows: Mapping[str, tuple[int, int]]) -> Scene:
+        """The part of a whole scene that one rank holds; its arrays are views.
 
         Local: does not communicate.
 
         Args:
-            where: a layout, for its part on this rank; or per field a half-open range of rows, whole cells.
+            rows: per field a half-open range of rows, whole cells.
 
         Raises:
-            LayoutError: the scene is a part already, or `where` lacks a field, is for another size or cuts
-                through a cell.
+            LayoutError: the scene is a part already, or `rows` lacks a field, goes beyond it or cuts through a cell.
         """
         if self.rows is not None:
             raise LayoutError("restrict: the scene is already the part of one rank")
-        own, places = {}, {}
-        found = where if isinstance(where, Mapping) else {f: where.rows(f) for f in where.fields}
-        rows = {f: (int(a), int(b)) for f, (a, b) in found.items()}
         for name, size in self.sizes.items():
             if name not in rows or not 0 <= rows[name][0] <= rows[name][1] <= size:
                 raise LayoutError(f"{name}: row range {rows.get(name)} is not inside 0:{size}")
-            if isinstance(where, Mapping):
-                own[name] = np.arange(*(n // self.block_size(name) for n in rows[name]))
-                continue
-            if where.sizes(name)[1] != size:
-                raise LayoutError(f"{name}: {size} rows in the scene, {where.sizes(name)[1]} in the layout")
-            own[name] = where.own_cells(name)
-            if name in where.cells:
-                places[name] = where.places(name)
-        own_rows = {f: rows_of(cells, self.block_size(f)) for f, cells in own.items()}
+        ranges = {f: (int(rows[f][0]), int(rows[f][1])) for f in self.sizes}
+
+        def of_rows(values: Mapping[str, Floats]) -> dict[str, Floats]:
+            return {f: v[slice(*ranges[f])] for f, v in values.items()}
 
         def of_cells(values: Any, name: str) -> Any:
-            return values[own[name]] if values is not None and name in own else None
+            if np.ndim(values) == 0:  # also None
+                return values
+            return np.asarray(values)[slice(*(n // self.block_size(name) for n in ranges[name]))]
 
-        material = self.material if "mass" in self.sizes else None
+        material = self.material
         if material is not None:
-            cut = {k: v if np.ndim(v) == 0 else np.asarray(v)[own["mass"]] for k, v in material.cell_data().items()}
-            material = Material(**cut, time_step=material.time_step)
-        part = Scene(
-            dimension=self.dimension,
-            sizes=dict(self.sizes),
-            blocks={
-                (r, c): _renumbered(_take_rows(b, own_rows[r]), places.get(c), self.block_size(c))
-                for (r, c), b in self.blocks.items()
-            },
-            rhs={f: v[own_rows[f]] for f, v in self.rhs.items()},
-            reference={f: v[own_rows[f]] for f, v in self.reference.items()},
-            cell_centers={f: v[own[f]] for f, v in self.cell_centers.items()},
-            cell_volumes={f: v[own[f]] for f, v in self.cell_volumes.items()},
+            own = {k: of_cells(v, "mass") for k, v in material.cell_data().items()}
+            material = Material(**own, time_step=material.time_step)
+        part = replace(
+            self,
+            blocks={(r, c): csr_rows(block, *ranges[r]) for (r, c), block in self.blocks.items()},
+            rhs=of_rows(self.rhs),
+            reference=of_rows(self.reference),
+            cell_centers={f: of_cells(v, f) for f, v in self.cell_centers.items()},
+            cell_volumes={f: of_cells(v, f) for f, v in self.cell_volumes.items()},
             cell_dimension=of_cells(self.cell_dimension, "mass"),
             contact_state=of_cells(self.contact_state, "contact"),
             material=material,
-            metadata=self.metadata,
-            rows=rows,
-            cells={f: own[f] for f in places},
+            rows=ranges,
         )
         part.validate()
         return part
-
-
-def _take_rows(block: CSR, rows: Integers) -> CSR:
-    """Some rows of a block, in the order given; without a copy if they follow each other."""
-    if not rows.size or (np.diff(rows) == 1).all():
-        return csr_rows(block, int(rows[0]), int(rows[-1]) + 1) if rows.size else csr_rows(block, 0, 0)
-    take, counts = gather_rows(block.indptr, rows)
-    return CSR(np.concatenate([[0], np.cumsum(counts)]), block.indices[take], block.data[take])
-
-
-def _renumbered(block: CSR, places: Integers | None, block_size: int) -> CSR:
-    """A block with other column numbers, see `renumber`; the same block where there are none."""
-    if places is None:
-        return block
-    out = CSR(block.indptr, np.empty_like(block.indices), np.empty_like(block.data))
-    renumber(block, places, block_size, out)
-    return out
 
 
 def contact_state_counts(states: Iterable[int]) -> dict[str, int]:

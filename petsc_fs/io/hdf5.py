@@ -61,7 +61,7 @@ def write(scene: Scene, path: str | os.PathLike[str], *, compression: str | None
     """
     target = Path(path)
     scene.validate()
-    if scene.cells or any(scene.row_range(f) != (0, n) for f, n in scene.sizes.items()):
+    if any(scene.row_range(f) != (0, n) for f, n in scene.sizes.items()):
         raise SceneError(f"{target}: only a whole scene can be written, this is the part of one rank")
     with complete(target) as temporary, h5py.File(temporary, "w") as file:
         write_group(file, scene, dataset_creator(compression))
