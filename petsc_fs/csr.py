@@ -201,27 +201,31 @@ def cut_rows(matrix: CSR, rows: Integers, owner: Integers, local: Integers, part
     for piece in np.split(rows, np.flatnonzero(np.diff(full)) + 1):
         take: Any
         take, counts = gather_rows(matrix.indptr, piece)
-        if take.size and take[-1] - take[0] == take.size - 1 and (np.diff(piece) == 1).all():
+        if take.size and (np.diff(piece) == 1).all():
             take = slice(take[0], take[-1] + 1)  # rows that follow each other: without a copy
         columns, data = matrix.indices[take], matrix.data[take]
-        row_of, owners = np.repeat(np.arange(piece.size), counts), owner[columns]
+        owners, starts = owner[columns], np.concatenate([[0], np.cumsum(counts)])
         for k, blocks in enumerate(found):
             mine = np.flatnonzero(owners == k)
-            blocks.append(_sorted_rows(row_of[mine], local[columns[mine]], data[mine], piece.size))
+            blocks.append(_in_order(CSR(np.searchsorted(mine, starts), local[columns[mine]], data[mine])))
     return [_stack(blocks) for blocks in found]
 
 
-def _sorted_rows(rows: Integers, columns: Integers, data: Floats, n: int) -> CSR:
-    """Compressed rows from triplets whose rows do not decrease; entries of the same place are added."""
-    place = rows * (int(columns.max(initial=0)) + 1) + columns
-    if (place[1:] < place[:-1]).any():
-        order = np.argsort(place, kind="stable")  # which is fast where most of it is in order, as here
-        columns, data, place = columns[order], data[order], place[order]
+def _in_order(block: CSR) -> CSR:
+    """The block with the columns of each row in order; entries of the same place are added."""
+    if increasing(block):
+        return block
+    n = block.indptr.size - 1
+    rows = np.repeat(np.arange(n), np.diff(block.indptr))
+    place = rows * (int(block.indices.max()) + 1) + block.indices
+    order = np.argsort(place, kind="stable")  # which is fast where most of it is in order, as here
+    place, block = place[order], CSR(block.indptr, block.indices[order], block.data[order])
     again = place[1:] == place[:-1]
-    if again.any():
-        first = np.flatnonzero(np.concatenate([[True], ~again]))
-        rows, columns, data = rows[first], columns[first], np.add.reduceat(data, first)
-    return CSR(np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))]), columns, data)
+    if not again.any():
+        return block
+    first = np.flatnonzero(np.concatenate([[True], ~again]))
+    data = np.add.reduceat(block.data, first)
+    return CSR(np.searchsorted(rows[first], np.arange(n + 1)), block.indices[first], data)
 
 
 def _stack(parts: list[CSR]) -> CSR:
