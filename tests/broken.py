@@ -393,9 +393,6 @@ def attempt(broken: Broken, comm: MPI.Intracomm) -> str:
 
 def use(path: Path, file: Path | None, comm: MPI.Intracomm) -> str:
     """Read a scene, solve it and write what came out, as `petsc-fs solve` does. Collective."""
-    from petsc4py import PETSc
-
-    from petsc_fs.cli.main import tree_for
     from petsc_fs.io.reader import read_distributed
     from petsc_fs.solver import Solver
 
@@ -404,9 +401,7 @@ def use(path: Path, file: Path | None, comm: MPI.Intracomm) -> str:
         if file is not None:
             options.read_header(file)
             new = options.insert_all(options.parse(file))
-        scene, layout = read_distributed(path, comm, index_type=PETSc.IntType)
-        if file is None:
-            new = options.insert_all(tree_for(scene, comm).options)
+        scene, layout = read_distributed(path, comm)
         solver = Solver(scene, comm, layout=layout)
         try:
             result = solver.solve()
