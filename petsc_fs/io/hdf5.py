@@ -20,7 +20,6 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from dataclasses import fields as attributes
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -33,7 +32,7 @@ import numpy as np
 from petsc_fs.errors import LayoutError, SceneError
 from petsc_fs.fields import FIELD, FIELD_NAMES, in_order
 from petsc_fs.io.files import check_regular, complete
-from petsc_fs.scene import CSR, Floats, Material, Metadata, Scene, check_order
+from petsc_fs.scene import CSR, Material, Metadata, Scene, check_order
 
 ENCODING = "petsc_fs scene"
 VERSION = 1
@@ -45,6 +44,7 @@ DEFLATE, SMALL = 1032, 2**26
 """Bytes that one byte of a deflated file can become at most, and bytes below which nobody minds."""
 PER_ROW = ("rhs", "reference")
 PER_CELL = ("cell_centers", "cell_volumes", "cell_dimension", "contact_state")
+INTEGERS = ("cell_dimension", "contact_state")
 
 
 def write(scene: Scene, path: str | os.PathLike[str], *, compression: str | None = "gzip") -> Path:
@@ -199,31 +199,41 @@ def read_group(
     group: h5py.Group, rows: Callable[[int, dict[str, int]], Mapping[str, tuple[int, int]]] | None = None
 ) -> Scene:
     """Read a scene, or the rows of one rank, from an open file or a group of one; see `read`."""
-    found = parts(group)
-    chosen = {f: (0, n) for f, n in found.sizes.items()} if rows is None else rows(found.dimension, found.sizes)
-    ranges = {f: (int(a), int(b)) for f, (a, b) in chosen.items()}
-    if rows is not None:
-        found.check_order()  # which a whole scene is asked for when it is there
+    dimension, sizes = read_header(group)
+    promised = sum(check_storage(group[name]) for name in ("fields", "blocks", "material") if name in group)
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    if rows is None and found.nbytes > memory:
-        raise SceneError(f"takes {found.nbytes / 2**30:.0f} GiB, and this machine has {memory / 2**30:.0f} GiB")
+    if rows is None and promised > memory:
+        raise SceneError(f"takes {promised / 2**30:.0f} GiB, and this machine has {memory / 2**30:.0f} GiB")
+    chosen = {f: (0, n) for f, n in sizes.items()} if rows is None else rows(dimension, sizes)
+    ranges = {f: (int(a), int(b)) for f, (a, b) in chosen.items()}
     arrays: dict[str, dict[str, Any]] = {what: {} for what in (*PER_ROW, *PER_CELL)}
-    for (name, what), dataset in found.arrays.items():
-        bs = FIELD[name].block_size(found.dimension) if what in PER_CELL else 1
-        values = dataset[slice(*(n // bs for n in ranges[name]))]
-        arrays[what][name] = values if what in ("cell_dimension", "contact_state") else real_numbers(values)
-    material = {
-        name: value if isinstance(value, float) else real_numbers(value[slice(*ranges["mass"])])
-        for name, value in found.material.items()
-    }
+    for f, size in sizes.items():
+        datasets, bs = group["fields"][f], FIELD[f].block_size(dimension)
+        for what, found in arrays.items():
+            unit = bs if what in PER_CELL else 1
+            if what in datasets:
+                shape = (size // unit, 3) if what == "cell_centers" else (size // unit,)
+                part = slice(*(n // unit for n in ranges[f]))
+                found[f] = _read_array(datasets[what], f"{f}: {what}", shape, part, what not in INTEGERS)
+    blocks: dict[tuple[str, str], CSR] = {}
+    for r, row in group["blocks"].items():
+        for c, block in row.items():
+            if r not in sizes or c not in sizes:
+                raise LayoutError(f"block ({r}, {c}): the scene has no field {r if r not in sizes else c!r}")
+            _check_block(block, f"block ({r}, {c})", (sizes[r], sizes[c]))
+            if r == c and rows is not None:  # a whole scene is asked for it when it is there
+                check_order(r, dimension, sizes[r], partial(_read_block, block, f"block ({r}, {c})"))
+            blocks[r, c] = _read_block(block, f"block ({r}, {c})", *ranges[r])
     scene = Scene(
-        dimension=found.dimension,
-        sizes=found.sizes,
-        blocks={rc: _read_block(block, *rc, *ranges[rc[0]]) for rc, block in found.blocks.items()},
+        dimension=dimension,
+        sizes=sizes,
+        blocks=blocks,
         cell_dimension=arrays.pop("cell_dimension").get("mass"),
         contact_state=arrays.pop("contact_state").get("contact"),
         **arrays,
-        material=Material(**material) if material else None,  # type: ignore[arg-type]
+        material=_read_material(group["material"], sizes["mass"], slice(*ranges["mass"]))
+        if "material" in group and "mass" in sizes
+        else None,
         metadata=read_metadata(group),
         rows=None if rows is None else ranges,
     )
@@ -323,10 +333,10 @@ def check_encoding(file: h5py.Group, encoding: str) -> None:
 
 
 def read_header(file: h5py.Group) -> tuple[int, dict[str, int]]:
-    """Dimension of a scene, and size of each field; what the file promises is there, see `check_storage`.
+    """Dimension of a scene, and size of each field.
 
     Raises:
-        SceneError: the file is not a scene of this version, or promises more than it holds.
+        SceneError: the file is not a scene of this version.
         LayoutError: a size is impossible.
     """
     check_encoding(file, ENCODING)
@@ -348,27 +358,28 @@ def read_header(file: h5py.Group) -> tuple[int, dict[str, int]]:
             )
         if sizes[name] < 0 or sizes[name] % bs:
             raise LayoutError(f"{name}: {sizes[name]} rows is not a multiple of block size {bs}")
-    for name in ("fields", "blocks", "material"):
-        if name in file:
-            check_storage(file[name])
     return dimension, {name: sizes[name] for name in in_order(sizes)}
 
 
-def check_storage(group: h5py.Group, depth: int = 3) -> None:
+def check_storage(group: h5py.Group, depth: int = 3) -> int:
     """Refuse datasets that promise more than the file holds, before anything is allocated for them.
 
     HDF5 fills in what is not there without a word: chunks that were never written, virtual datasets whose sources are
     missing.
 
+    Returns:
+        Size of all datasets, in bytes.
+
     Raises:
         SceneError: a dataset lies in another file, is not written in full, or says that it is larger than it can be.
     """
+    total = 0
     for name in group:
         if isinstance(group.get(name, getlink=True), h5py.ExternalLink):
             raise SceneError(f"{group.name}/{name} lies in another file; a scene is one file: copy it into it")
         item = group[name]
         if isinstance(item, h5py.Group) and depth:
-            check_storage(item, depth - 1)
+            total += check_storage(item, depth - 1)
         if not isinstance(item, h5py.Dataset) or not item.shape or 0 in item.shape:
             continue
         made, size, stored = item.id.get_create_plist(), item.id.get_type().get_size(), item.id.get_storage_size()
@@ -387,85 +398,17 @@ def check_storage(group: h5py.Group, depth: int = 3) -> None:
             raise SceneError(f"{item.name} is not written in full, so that HDF5 would make it up; export it again")
         if stored > item.file.id.get_filesize() or promised > max(SMALL, DEFLATE * stored):
             raise SceneError(f"{item.name} says that it has {promised} bytes, and {stored} are there; export it again")
+        total += promised
+    return total
 
 
-@dataclass(frozen=True, kw_only=True)
-class Parts:
-    """What a scene in a file is made of; shapes and kinds are checked, no array is read.
-
-    Attributes:
-        dimension: of the rock matrix.
-        sizes: number of unknowns of each field.
-        arrays: (field, what) to dataset, for `PER_ROW` and `PER_CELL`.
-        blocks: (row field, column field) to the group of a block.
-        material: datasets and numbers by name; empty if unknown.
-    """
-
-    dimension: int
-    sizes: dict[str, int]
-    arrays: dict[tuple[str, str], h5py.Dataset]
-    blocks: dict[tuple[str, str], h5py.Group]
-    material: dict[str, h5py.Dataset | float]
-
-    @property
-    def nbytes(self) -> int:
-        """Size of all arrays."""
-        blocks = [group[name] for group in self.blocks.values() for name in CSR._fields]
-        material = [value for value in self.material.values() if not isinstance(value, float)]
-        return sum(int(dataset.nbytes) for dataset in (*self.arrays.values(), *blocks, *material))
-
-    def check_order(self) -> None:
-        """Refuse fields that are numbered component by component; a few rows of their blocks are read.
-
-        Raises:
-            LayoutError: there is one.
-        """
-        for (r, c), block in self.blocks.items():
-            if r == c:
-                check_order(r, self.dimension, self.sizes[r], partial(_read_block, block, r, r))
-
-
-def parts(file: h5py.Group) -> Parts:
-    """Find the parts of a scene, and check all that can be checked without reading them.
-
-    Raises:
-        SceneError: as `read_header`; a dataset is missing or of another kind.
-        LayoutError: a shape is wrong.
-    """
-    dimension, sizes = read_header(file)
-    arrays: dict[tuple[str, str], h5py.Dataset] = {}
-    for f, size in sizes.items():
-        group, cells = file["fields"][f], size // FIELD[f].block_size(dimension)
-        if "rhs" not in group:
-            raise LayoutError(f"{f}: rhs is missing")
-        for what in (*PER_ROW, *PER_CELL):
-            if what in group:
-                shape: tuple[int, ...] = (size,) if what in PER_ROW else (cells,)
-                check_dataset(group[what], f"{f}: {what}", (cells, 3) if what == "cell_centers" else shape)
-                arrays[f, what] = group[what]
-    blocks: dict[tuple[str, str], h5py.Group] = {}
-    for r, row in file["blocks"].items():
-        for c, block in row.items():
-            if r not in sizes or c not in sizes:
-                raise LayoutError(f"block ({r}, {c}): the scene has no field {r if r not in sizes else c!r}")
-            check_block(block, f"block ({r}, {c})", (sizes[r], sizes[c]))
-            blocks[r, c] = block
-    material: dict[str, h5py.Dataset | float] = {}
-    if "material" in file and "mass" in sizes:
-        group = file["material"]
-        for name in (a.name for a in attributes(Material)):
-            material[name] = group[name] if name in group else attribute(group, name, float)
-            if name in group:
-                check_dataset(group[name], f"material: {name}", (sizes["mass"],))
-    return Parts(dimension=dimension, sizes=sizes, arrays=arrays, blocks=blocks, material=material)
-
-
-def check_dataset(dataset: h5py.Dataset, what: str, shape: tuple[int, ...]) -> None:
-    """The shape and kind of a dataset of real numbers."""
+def _read_array(dataset: h5py.Dataset, what: str, shape: tuple[int, ...], part: slice, real: bool = True) -> Any:
+    """Part of a dataset, whose shape and kind must be right; as double if `real`."""
     if dataset.shape != shape:
         raise LayoutError(f"{what} has shape {dataset.shape}, expected {shape}")
     if dataset.dtype.kind not in "biuf":
         raise SceneError(f"the scene is damaged ({what}: expected real numbers)")
+    return dataset[part].astype(np.float64, copy=False) if real else dataset[part]
 
 
 def read_metadata(file: h5py.Group) -> Metadata:
@@ -481,8 +424,7 @@ def read_metadata(file: h5py.Group) -> Metadata:
     )
 
 
-def _read_block(group: h5py.Group, r: str, c: str, start: int, stop: int) -> CSR:
-    what = f"block ({r}, {c})"
+def _read_block(group: h5py.Group, what: str, start: int, stop: int) -> CSR:
     pointers, columns, values = (group[name] for name in CSR._fields)
     indptr = pointers[start : stop + 1].astype(np.int64)
     a, b = int(indptr[0]), int(indptr[-1])
@@ -494,10 +436,10 @@ def _read_block(group: h5py.Group, r: str, c: str, start: int, stop: int) -> CSR
         raise LayoutError(f"{what}: indptr runs to {b}, but there are {values.size} values")
     if stop == pointers.size - 1 and b != values.size:
         raise LayoutError(f"{what}: indptr ends at {b}, but there are {values.size} values")
-    return CSR(indptr - a, columns[a:b], real_numbers(values[a:b]))
+    return CSR(indptr - a, columns[a:b], _read_array(values, f"{what}: data", columns.shape, slice(a, b)))
 
 
-def check_block(group: h5py.Group, what: str, shape: tuple[int, int]) -> None:
+def _check_block(group: h5py.Group, what: str, shape: tuple[int, int]) -> None:
     """The shapes and kinds of the datasets of a block."""
     encoding, found = attribute(group, "encoding-type", str), tuple(np.ravel(group.attrs["shape"]).tolist())
     if encoding != "csr_matrix":
@@ -511,9 +453,13 @@ def check_block(group: h5py.Group, what: str, shape: tuple[int, int]) -> None:
         raise LayoutError(f"{what}: indptr has {pointers.size} entries, expected {shape[0] + 1}")
     if columns.ndim != 1 or columns.shape != values.shape:
         raise LayoutError(f"{what}: {columns.size} indices but {values.size} values")
-    check_dataset(values, f"{what}: data", values.shape)
 
 
-def real_numbers(values: Any) -> Floats:
-    """Numbers as they are computed with; a TypeError for text and complex numbers."""
-    return np.asarray(values).astype(np.float64, casting="same_kind", copy=False)
+def _read_material(group: h5py.Group, size: int, part: slice) -> Material:
+    values: dict[str, Any] = {
+        name: _read_array(group[name], f"material: {name}", (size,), part)
+        if name in group
+        else attribute(group, name, float)
+        for name in (a.name for a in attributes(Material))
+    }
+    return Material(**values)
