@@ -16,7 +16,6 @@ from petsc4py import PETSc
 from petsc_fs import nest
 from petsc_fs.errors import LayoutError, SceneError, together
 from petsc_fs.fields import MECHANICS
-from petsc_fs.fixed_stress import analytic_coefficients as fixed_stress_coefficients
 from petsc_fs.nest import Blocks
 from petsc_fs.partition import Layout
 from petsc_fs.scene import CSR, Scene, csr_rows
@@ -178,8 +177,7 @@ class System:
                     f"block ({r}, {c}): {block.data.size} entries on a rank; "
                     "use more ranks, or a PETSc with 64-bit indices"
                 )
-        if hasattr(scene, "check_rows"):
-            scene.check_rows()
+        scene.check_rows()
 
     def _bsize(self, r: str, c: str) -> tuple[int, int]:
         return self.layout.block_size(r), self.layout.block_size(c)
@@ -281,7 +279,7 @@ class System:
         coefficients, centers = None, {}
         with together(comm):
             if scene is not None:
-                coefficients = fixed_stress_coefficients(scene) if "mass" in fields else None
+                coefficients = scene.fixed_stress_coefficients() if "mass" in fields else None
                 centers = {f: v for f, v in scene.cell_centers.items() if f in MECHANICS}
         known = comm.bcast((coefficients is not None, sorted(centers)))
         if known[0]:

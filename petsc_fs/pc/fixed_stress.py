@@ -23,7 +23,7 @@ class FixedStress(WrapperPC):
         -fs_field mass: name of the field.
         -fs_type analytic: D_55 = base * ratio ** damping (paper, eq:fixed_stress_coefs), from the vectors
             "fixed_stress_base" and "fixed_stress_ratio" (1 if it is missing) that are composed on the block; the
-            default where they are there. `petsc_fs.scene.fixed_stress_coefficients` has the formulas.
+            default where they are there. `petsc_fs.scene.Scene.fixed_stress_coefficients` has the formulas.
         -fs_type algebraic: D_55 from the matrix alone, see `petsc_fs.pc.algebraic`; the operator must be the Schur
             complement that PCFIELDSPLIT makes, which knows the blocks of mechanics.
         -fs_damping t: the exponent; 1 is the paper's formula, the default 0.6 is what its published code uses.
