@@ -232,8 +232,9 @@ class System:
                 self._patterns[rc] = block
                 todo.append((rc, not same))
         todo = self.layout.comm.bcast(todo)
-        for rc in set(self.blocks) - {rc for rc, _ in todo}:
+        for rc in sorted(set(self.blocks) - {rc for rc, _ in todo}):
             self.blocks.pop(rc).destroy()
+            self._patterns.pop(rc, None)
         for rc, changed in todo:
             if changed:
                 if rc in self.blocks:

@@ -10,7 +10,7 @@ from sample import SCENES, csr, dense
 
 from petsc_fs.errors import together
 from petsc_fs.io import hdf5
-from petsc_fs.partition import Layout
+from petsc_fs.partition import Layout, rows_of
 from petsc_fs.result import Result
 from petsc_fs.scene import CSR, Scene
 from petsc_fs.solver import Solver
@@ -20,6 +20,7 @@ comm = MPI.COMM_WORLD
 NAMES = tuple(path.stem for path in sorted(SCENES.glob("*.h5")))
 FILE = {"biot": "poromechanics.opts", "flow": "flow.opts", "contact": "contact_mechanics.opts"}
 """Options file of the published configuration; contact_poromechanics.opts for other scenes."""
+__all__ = ["MPI", "SCENES", "Layout", "rows_of"]
 EPS = 2.0**-52
 Arrays = Mapping[str, np.ndarray]
 

@@ -1,4 +1,7 @@
-"""Displacements component by component: what the sweep is. (The contract of every PC is in test_pc.)"""
+"""Displacements component by component: what the sweep is.
+
+The contract of every PC is in test_pc.
+"""
 
 import numpy as np
 import pytest
@@ -85,8 +88,11 @@ def test_a_matrix_that_is_kept_may_have_new_values(clean):
 
 @pytest.mark.parametrize(
     ("name", "order", "message"),
-    [("model2", "sideways", "-c_component_order sideways: expected forward or backward or none"), ("flow", "none", "has no components")],
-)  # fmt: skip
+    [
+        ("model2", "sideways", "-c_component_order sideways: expected forward or backward or none"),
+        ("flow", "none", "has no components"),
+    ],
+)
 def test_what_it_cannot_sweep_is_refused(clean, name, order, message):
     matrix = mechanics(name) if name == "model2" else system_of(load(name)).blocks["mass", "mass"]
     with pytest.raises(Exception, match=r".*") as caught:

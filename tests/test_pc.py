@@ -280,7 +280,12 @@ def test_nothing_is_transformed_where_contact_does_not_act(database, side, missi
         ("poromechanics", "biot", {"fieldsplit_mass_fs_type": "guess"}, "expected analytic or algebraic"),
         ("poromechanics", "biot", {"fieldsplit_mass_fs_type": "analytic"}, "use -fieldsplit_mass_fs_type algebraic"),
         ("contact_poromechanics", "model1", {"qr_fieldsplit_1_fieldsplit_1_fs_field": "heat"}, "_fs_field NAME"),
-        ("contact_poromechanics", "model1", {"qr_fieldsplit_1_pc_fieldsplit_1_fields": "7"}, "no field 7 at this level"),
+        (
+            "contact_poromechanics",
+            "model1",
+            {"qr_fieldsplit_1_pc_fieldsplit_1_fields": "7"},
+            "no field 7 at this level",
+        ),
     ],
 )
 def test_what_a_pc_cannot_work_with_is_named_with_the_option(database, file, name, given, message):
