@@ -24,11 +24,10 @@ from petsc_fs.partition import Layout, chosen, partition
 from petsc_fs.petsc_errors import brief, reason_name, translate
 from petsc_fs.result import Result
 from petsc_fs.scene import Scene
-from petsc_fs.system import FieldArrays, System, norm
+from petsc_fs.system import EPS, FieldArrays, System, norm
 
 __all__ = ["Result", "Solver"]
 
-MAT_TYPES = ("nest", "aij")
 MOST_PASSES = 20
 """The Krylov method and its corrections; each has to halve what is missing."""
 NOT_FINITE = ("DIVERGED_NANORINF", "DIVERGED_PCSETUP_FAILED", "DIVERGED_PC_FAILED")
@@ -41,7 +40,6 @@ class Solver:
     Where the database chooses no preconditioner (`-pc_type`), the default options file for the scene's fields does.
 
     Options:
-        -petsc_fs_mat_type nest|aij: storage of the Jacobian; aij copies the blocks into one matrix.
         -petsc_fs_partition, -petsc_fs_ordering: see `petsc_fs.partition.partition`.
         -petsc_fs_retry FILE|none: options file of a second solve, where the first has not converged; its options have
             the prefix retry_. Default none.
@@ -99,9 +97,7 @@ class Solver:
             self.system = System(self.layout, root_only=root_only, coordinates=needs_coordinates(prefix))
             self.system.take(self._scene, release=release)
             self._forget_blocks()
-            self._mat_type = mat_type(prefix)
-            self._matrix = self._make_matrix(self._mat_type)
-            self.ksp = self._make_ksp(self._matrix, prefix)
+            self.ksp = self._make_ksp(prefix)
         tolerances = self.ksp.getTolerances()
         self.rtol, self._atol = float(tolerances[0]), float(tolerances[1])
         self._finalizer = weakref.finalize(self, _dropped.__setitem__, next(_numbers), _Parts(self))
@@ -141,16 +137,16 @@ class Solver:
             if collecting:
                 gc.enable()
 
-    def _make_matrix(self, kind: str) -> PETSc.Mat:
-        """What the KSP works on: the nest itself, or a copy in one matrix. Collective."""
-        if len(self.layout.fields) == 1:
-            return self.system.blocks[self.layout.fields[0], self.layout.fields[0]]
-        return nest.one_matrix(self.system.J) if kind == "aij" else self.system.J
+    @property
+    def _matrix(self) -> PETSc.Mat:
+        """What the KSP works on: the nest, or the only block."""
+        fields = self.layout.fields
+        return self.system.J if len(fields) > 1 else self.system.blocks[fields[0], fields[0]]
 
-    def _make_ksp(self, matrix: PETSc.Mat, prefix: str) -> PETSc.KSP:
+    def _make_ksp(self, prefix: str) -> PETSc.KSP:
         ksp = PETSc.KSP().create(self.layout.comm)
         ksp.setOptionsPrefix(prefix)
-        ksp.setOperators(matrix, matrix)
+        ksp.setOperators(self._matrix, self._matrix)
         nest.give_fields(ksp)
         try:
             ksp.setFromOptions()
@@ -158,6 +154,8 @@ class Solver:
             ksp.destroy()
             raise UsageError(f"PETSc refuses an option: {brief(e)}") from e
         ksp.setConvergenceHistory(reset=True)
+        if ksp.getType() == PETSc.KSP.Type.GMRES:
+            ksp.setComputeSingularValues(True)  # of what it projects anyway
         return ksp
 
     def update(self, scene: Scene | None) -> None:
@@ -171,14 +169,10 @@ class Solver:
         started = time.perf_counter()
         _destroy_dropped(self.layout.comm)
         self._scene = self._part(scene)
-        before = self._matrix if self._matrix is not self.system.J else None
         with self._options():
             self.system.take(self._scene)
             self._forget_blocks()
-            self._matrix = self._make_matrix(self._mat_type)
             self.ksp.setOperators(self._matrix, self._matrix)
-        if before is not None and len(self.layout.fields) > 1:
-            before.destroy()
         self._drop_retry()
         PETSc.garbage_cleanup(self.layout.comm)
         self._built_seconds = time.perf_counter() - started
@@ -230,66 +224,35 @@ class Solver:
     def _run(self, ksp: PETSc.KSP, wanted: float) -> Result:
         """The Krylov method and its corrections, and what comes of them. Collective."""
         started = time.perf_counter()
-        system, max_it = self.system, ksp.getTolerances()[3]
-        atol = math.ldexp(self._atol, system.rhs_scale) if self._atol > PETSC_ATOL else 0.0
-        x, r, d = (system.b.duplicate() for _ in range(3))
-        x.set(0.0)
-        system.b.copy(r)
-        check, iterations, passes, reason = system.check(x, r), 0, 0, "CONVERGED_ATOL"
-        goal = max(wanted, atol / size) if (size := norm(check.rhs)) else 1.0
-        field_goal = field_tolerance(wanted)
-        aim, history = wanted, []
+        system = self.system
+        run = _Run(system, ksp, wanted, self._atol if self._atol > PETSC_ATOL else 0.0)
         try:
-            while check.excess(goal, field_goal) > 1.0 and passes < MOST_PASSES and iterations < max_it:
-                ksp.setTolerances(rtol=aim, atol=0.0, max_it=max_it - iterations)
-                try:
-                    ksp.solve(r, d)
-                except (PETSc.Error, ImportError) as e:
-                    raise translate(e, "solve failed") from None
-                passes += 1
-                iterations += ksp.getIterationNumber()
-                history.append(np.asarray(ksp.getConvergenceHistory()))
-                reason = reason_name(ksp)
-                x.axpy(1.0, d)
-                latest = system.check(x, r)
-                if not math.isfinite(latest.excess(goal, field_goal)):
-                    where = broken_level(ksp.getPC()) if passes == 1 or reason in NOT_FINITE else ""
-                    raise SolveError(
-                        f"the solution is not finite after {iterations} iterations ({reason})" + (where and f"; {where}")
-                    )
-                if latest.excess(goal, field_goal) > 1.0:
-                    latest = system.check(x, r, exactly=True)
-                missing = latest.excess(goal, field_goal)
-                if passes > 1 and missing > 0.5 * check.excess(goal, field_goal):
-                    if missing > check.excess(goal, field_goal):
-                        x.axpy(-1.0, d)
-                        latest = system.check(x, r, exactly=True)
-                    check = latest
-                    break
-                check = latest
-                aim = min(0.5, max(0.5 / missing, 1e-12)) if missing > 0 else 0.5
+            run.first()
+            run.correct()
+            run.estimate_error()
+            self._history = np.concatenate(run.history) if run.history else np.zeros(0)
+            solution = {f: np.ldexp(v, -system.rhs_scale) for f, v in system.by_field(run.x).items()}
         finally:
-            ksp.setTolerances(rtol=self.rtol, atol=self._atol, max_it=max_it)
-        self._history = np.concatenate([[*h] for h in history]) if history else np.zeros(0)
-        solution = {f: np.ldexp(v, -system.rhs_scale) for f, v in system.by_field(x).items()}
-        for vector in (x, r, d):
-            vector.destroy()
-        excess = check.excess(goal, field_goal)
+            run.destroy()
+            ksp.setTolerances(rtol=self.rtol, atol=self._atol, max_it=run.max_it)
+        check, size = run.check, norm(run.check.rhs)
         return Result(
-            iterations=iterations,
-            converged=excess <= 1.0,
-            reason=reason,
+            iterations=run.iterations,
+            converged=run.missing <= 1.0 and run.is_determined,
+            reason=run.reason,
             rtol=wanted,
-            tolerance=goal,
-            field_tolerance=field_goal,
+            tolerance=run.goal,
+            field_tolerance=run.field_goal,
             true_relative_residual=check.relative,
             residual_by_field={f: n / (size or 1.0) for f, n in check.residual.items()},
             backward_error_by_field=check.backward,
+            estimated_error_by_field=run.estimates,
             error_by_field=self._errors(solution),
-            passes=passes,
+            passes=run.passes,
             setup_seconds=0.0,
             solve_seconds=time.perf_counter() - started,
             solution=solution,
+            notes=run.notes,
         )
 
     def _errors(self, solution: FieldArrays) -> dict[str, float]:
@@ -341,11 +304,217 @@ class Solver:
 
 PETSC_ATOL = 1e-50
 """PETSc's own absolute tolerance, which stands for none."""
+WELL_DETERMINED = 1e-3
+"""Estimated relative error of each field up to which a solution is taken as it is."""
+DETERMINED = 1e-2
+"""Relative correction of each field up to which a solution counts as one."""
+USUAL = 1e-5
+"""Least singular values of A M^-1 above this occur where only the units of fields differ; they cast no doubt."""
+CORRECTION = 1e-1
+"""Relative tolerance of a correction that measures the error."""
 
 
-def field_tolerance(rtol: float) -> float:
-    """Backward error that each field may have."""
-    return rtol
+class _Run:
+    """One solve: a Krylov method on the equilibrated system, and corrections as the user's system asks for them.
+
+    Attributes:
+        x: the solution so far, of the system as it is in PETSc.
+        check: how well it satisfies the user's system.
+        missing: by what factor it misses the tolerances.
+        goal: tolerance of the residual, relative to |b|.
+        field_goal: backward error that each field may have.
+        estimates: estimated relative error of each field.
+        is_determined: whether the equations determine the solution to `DETERMINED`.
+    """
+
+    def __init__(self, system: System, ksp: PETSc.KSP, rtol: float, atol: float) -> None:
+        self.system, self.ksp, self.rtol = system, ksp, rtol
+        self.x, self.r, self.d = (system.b.duplicate() for _ in range(3))
+        self.max_it = int(ksp.getTolerances()[3])
+        self.iterations = self.passes = 0
+        self.reason = "CONVERGED_ATOL"
+        self.history: list[NDArray[np.float64]] = []
+        self.notes: tuple[str, ...] = ()
+        self.estimates: dict[str, float] = {}
+        self.is_determined = True
+        self._weighted: PETSc.KSP | None = None
+        self.x.set(0.0)
+        self.check = system.check(self.x, self.r)
+        size = norm(self.check.rhs)
+        self.goal = max(rtol, math.ldexp(atol, system.rhs_scale) / size) if size else 1.0
+        self.field_goal = rtol
+        self.missing = self.check.excess(self.goal, self.field_goal) if size else 0.0
+
+    def first(self) -> None:
+        """The Krylov method by its options. Collective."""
+        if self.missing > 1.0:
+            self._pass(self.ksp, max(self.rtol, min(self.goal, 0.5)))
+            self.x.axpy(1.0, self.d)
+            self._judge()
+
+    def correct(self) -> None:
+        """Corrections, as long as each of them halves what is missing. Collective.
+
+        Rounding of the Krylov method's recursion, and norms: it may have stopped where a field has not.
+        """
+        if self.ksp.getType() == PETSc.KSP.Type.PREONLY:
+            return
+        while self.missing > 1.0 and self.passes < MOST_PASSES and self.iterations < self.max_it:
+            before, old = self.check, self.missing
+            self._pass(self._weigh(), 0.5)
+            self.x.axpy(1.0, self.d)
+            self._judge()
+            if self.missing > 0.5 * old:
+                if self.missing > old:
+                    self.x.axpy(-1.0, self.d)
+                    self.check, self.missing = before, old
+                    self.system.check(self.x, self.r)
+                return
+
+    def estimate_error(self) -> None:
+        """Estimate the error of each field, and where that casts doubt, measure it by a correction. Collective.
+
+        One application of the preconditioner to the residual is an estimate, over the least singular value that GMRES
+        has seen. A correction solves for the error itself, whatever the preconditioner is worth.
+        """
+        if self.missing > 1.0 or not self.passes:
+            return
+        try:
+            self.ksp.getPC().apply(self.r, self.d)
+        except (PETSc.Error, ImportError) as e:
+            raise translate(e, "the preconditioner failed") from None
+        least = 1.0
+        if self.ksp.getType() == PETSc.KSP.Type.GMRES and self.ksp.getIterationNumber():
+            seen = float(self.ksp.computeExtremeSingularValues()[1])
+            least = max(seen, EPS) if seen < USUAL else 1.0
+        self.estimates = {f: e / least for f, e in self._relative(self.d).items()}
+        if all(e <= WELL_DETERMINED for e in self.estimates.values()):
+            return
+        if self.ksp.getType() != PETSC_PREONLY and self.iterations < self.max_it:
+            self._pass(self._weigh(), CORRECTION)
+            self.estimates = self._relative(self.d)
+            old = self.missing
+            self.x.axpy(1.0, self.d)
+            self._judge()
+            if self.missing > max(1.0, old):
+                self.x.axpy(-1.0, self.d)
+                self._judge()
+        self.is_determined = all(e <= DETERMINED for e in self.estimates.values())
+        if not self.is_determined:
+            found = ", ".join(f"{f} {e:.0e}" for f, e in self.estimates.items() if not e <= DETERMINED)
+            self.notes += (
+                "ill-conditioned: the residual is small, but says little of the error, which is estimated at a part "
+                f"of the solution of {found}; at most {DETERMINED:g} counts as converged",
+            )
+
+    def _relative(self, part: PETSc.Vec) -> dict[str, float]:
+        """Size of each field of a vector beside that of the solution, or beside what would change any equation."""
+        sizes = self.system.norms(self.system.by_field(self.x))
+        least = self.system.least_sizes(self.check, self.field_goal)
+        found = self.system.norms(self.system.by_field(part))
+        return {f: n / (max(sizes[f], least[f]) or 1.0) for f, n in found.items()}
+
+    def _pass(self, ksp: PETSc.KSP, rtol: float) -> None:
+        """Run a Krylov method on the present residual; what it finds is in `d`. Collective."""
+        ksp.setTolerances(rtol=rtol, atol=0.0, max_it=max(self.max_it - self.iterations, 1))
+        try:
+            ksp.solve(self.r, self.d)
+        except (PETSc.Error, ImportError) as e:
+            raise translate(e, "solve failed") from None
+        self.passes += 1
+        self.iterations += ksp.getIterationNumber()
+        self.history.append(np.array(ksp.getConvergenceHistory()))
+        self.reason = reason_name(ksp)
+
+    def _judge(self) -> None:
+        """See where x stands. Collective.
+
+        Raises:
+            SolveError: it is not finite.
+        """
+        self.check = self.system.check(self.x, self.r)
+        self.missing = self.check.excess(self.goal, self.field_goal)
+        if not math.isfinite(self.missing):
+            where = broken_level(self.ksp.getPC())
+            raise SolveError(
+                f"the solution is not finite after {self.iterations} iterations ({self.reason})"
+                + (f"; {where}" if where else "")
+            )
+        if self.missing > 1.0:
+            self.check = self.system.check(self.x, self.r, exactly=True)
+            self.missing = self.check.excess(self.goal, self.field_goal)
+
+    def _weigh(self) -> PETSc.KSP:
+        """GMRES in the norm in which what is missing counts, with the preconditioner that is there. Collective."""
+        system, check = self.system, self.check
+        size = norm(check.rhs) * self.goal
+        weights = {}
+        for f, terms in check.terms.items():
+            own = self.field_goal * terms
+            wanted = own if check.rounded(f) else min(own, size)
+            weights[f] = 2.0 ** -system.row_scale[f] / wanted if wanted else 1.0
+        parts = [np.full(system.layout.sizes(f)[0], weights[f]) for f in system.layout.fields]
+        context = _Weighted(system.b.duplicate(), self._matrix, self.ksp.getPC())
+        context.w.setArray(np.concatenate(parts))
+        self._end_weighted()
+        comm = system.layout.comm
+        A = PETSc.Mat().createPython(self._matrix.getSizes(), context, comm=comm)
+        A.setUp()
+        ksp = PETSc.KSP().create(comm)
+        ksp.setOperators(A, A)
+        ksp.setType(PETSc.KSP.Type.GMRES)
+        ksp.setGMRESRestart(CORRECTION_RESTART)
+        ksp.setPCSide(PETSc.PC.Side.RIGHT)
+        ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
+        ksp.setConvergenceHistory(reset=True)
+        ksp.getPC().setType("python")
+        ksp.getPC().setPythonContext(context)
+        self._weighted, self._context = ksp, context
+        self.r.pointwiseMult(self.r, context.w)
+        return ksp
+
+    @property
+    def _matrix(self) -> PETSc.Mat:
+        return self.ksp.getOperators()[0]
+
+    def _end_weighted(self) -> None:
+        if self._weighted is not None:
+            self._weighted.destroy()
+            self._context.destroy()
+            self._weighted = None
+
+    def destroy(self) -> None:
+        """Collective."""
+        self._end_weighted()
+        for vector in (self.x, self.r, self.d):
+            vector.destroy()
+
+
+CORRECTION_RESTART = 60
+PETSC_PREONLY = PETSc.KSP.Type.PREONLY
+
+
+class _Weighted:
+    """The system with its rows multiplied by weights, and its preconditioner, which need not know of them."""
+
+    def __init__(self, w: PETSc.Vec, A: PETSc.Mat, M: PETSc.PC) -> None:
+        self.w, self.A, self.M = w, A, M
+        self.work = w.duplicate()
+
+    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Y = W A x. Collective."""
+        self.A.mult(x, y)
+        y.pointwiseMult(y, self.w)
+
+    def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Y = M^-1 W^-1 x. Collective."""
+        self.work.pointwiseDivide(x, self.w)
+        self.M.apply(self.work, y)
+
+    def destroy(self, *_: PETSc.Object) -> None:
+        """Collective; may be called several times."""
+        self.w.destroy()
+        self.work.destroy()
 
 
 class _Parts:
@@ -381,15 +550,11 @@ class _Retry:
         self.prefix = f"{solver.prefix}retry_"
         file = database.fitting_file(name, solver.layout.fields)
         self._inserted = database.insert_all(database.parse(file), self.prefix)
-        self._matrix = solver._make_matrix(mat_type(self.prefix))
-        self._own = self._matrix is not solver.system.J and len(solver.layout.fields) > 1
-        self.ksp = solver._make_ksp(self._matrix, self.prefix)
+        self.ksp = solver._make_ksp(self.prefix)
 
     def destroy(self) -> None:
         """Collective."""
         self.ksp.destroy()
-        if self._own:
-            self._matrix.destroy()
         database.delete_all(self._inserted)
 
 
@@ -402,18 +567,6 @@ def _set_up(ksp: PETSc.KSP) -> None:
             level.setUpOnBlocks()
     except (PETSc.Error, ImportError) as e:
         raise translate(e, "set-up failed") from None
-
-
-def mat_type(prefix: str) -> str:
-    """Value of -petsc_fs_mat_type. Local.
-
-    Raises:
-        UsageError: it has an impossible value.
-    """
-    kind = str(PETSc.Options(prefix).getString("petsc_fs_mat_type", MAT_TYPES[0]))
-    if kind not in MAT_TYPES:
-        raise UsageError(f"-{prefix}petsc_fs_mat_type {kind}: expected {' or '.join(MAT_TYPES)}")
-    return kind
 
 
 def needs_coordinates(prefix: str) -> bool:

@@ -58,14 +58,14 @@ class Check:
         """|b_f - A_f x| / | |A_f| |x| + |b_f| | per field: by how much its equations must be changed to hold."""
         return {f: r / (self.terms[f] or 1.0) for f, r in self.residual.items()}
 
-    @property
-    def rounded(self) -> bool:
-        """Whether rounding explains the residual in every field."""
-        return all(e <= ROUNDING_UNITS * EPS for e in self.backward.values())
+    def rounded(self, f: str) -> bool:
+        """Whether rounding explains the residual of a field."""
+        return self.residual[f] <= ROUNDING_UNITS * EPS * self.terms[f]
 
     def excess(self, tolerance: float, field_tolerance: float) -> float:
-        """By what factor the tolerances are missed; at most 1 where they are met."""
-        overall = 0.0 if self.rounded else self.relative / tolerance
+        """By what factor the tolerances are missed; at most 1 where they are met, but for what rounding explains."""
+        left = {f: 0.0 if self.rounded(f) else r for f, r in self.residual.items()}
+        overall = norm(left) / (norm(self.rhs) or 1.0) / tolerance
         return max(overall, *(e / field_tolerance for e in self.backward.values()))
 
 
@@ -87,6 +87,7 @@ class System:
         b: right-hand side, numbered as J: on each rank field by field.
         row_scale: per field the exponent of two that its rows are multiplied by.
         rhs_scale: the exponent that the right-hand side, and with it the solution, is multiplied by besides.
+        block_norms: largest row sum of |entries| of each block, as it was given.
         renewals: how often blocks were made anew because their pattern had changed.
     """
 
@@ -106,6 +107,7 @@ class System:
         self.renewals = 0
         self.row_scale = dict.fromkeys(layout.fields, 0)
         self.rhs_scale = 0
+        self.block_norms: dict[Pair, float] = {}
         self._coordinates = coordinates
         self._patterns: dict[Pair, CSR] = {}
         given = Layout.contiguous(layout.comm, layout.dimension, {f: layout.sizes(f)[1] for f in layout.fields})
@@ -311,8 +313,8 @@ class System:
 
     def _equilibrate(self, rhs: FieldArrays) -> None:
         """Multiply the rows of each field by a power of two, so that blocks are alike in size whatever the units."""
-        sizes = {rc: block.norm(PETSc.NormType.INFINITY) for rc, block in self.blocks.items()}
-        exponents = row_exponents(sizes)
+        self.block_norms = {rc: block.norm(PETSc.NormType.INFINITY) for rc, block in self.blocks.items()}
+        exponents = row_exponents(self.block_norms)
         largest = np.array([float(np.abs(rhs[f]).max(initial=0.0)) for f in self.layout.fields])
         self.layout.comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
         logs = {f: math.log2(v) for f, v in zip(self.layout.fields, largest, strict=True) if v > 0}
@@ -361,6 +363,11 @@ class System:
             r.setArray(np.concatenate([*residual.values()]))
             found = ({f: np.ldexp(v, -self.row_scale[f]) for f, v in part.items()} for part in (residual, terms, rhs))
             return Check(*(self.norms(part) for part in found))
+
+    def least_sizes(self, check: Check, tolerance: float) -> dict[str, float]:
+        """Per field the size below which it changes no equation by more than a tolerance of its terms. Local."""
+        limits = {f: [check.terms[r] / n for (r, c), n in self.block_norms.items() if c == f and n] for f in check.terms}
+        return {f: tolerance * min(found, default=0.0) for f, found in limits.items()}
 
     def norms(self, arrays: Mapping[str, Floats]) -> dict[str, float]:
         """Euclidean norm of each field over all ranks. Collective."""
