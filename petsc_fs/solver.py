@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import gc
 import itertools
-import math
 import time
 import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -19,19 +17,16 @@ from petsc4py import PETSc
 
 from petsc_fs import nest
 from petsc_fs import options as database
-from petsc_fs.errors import SceneError, SolveError, UsageError
+from petsc_fs.errors import SceneError, UsageError
 from petsc_fs.partition import Layout, chosen, partition
-from petsc_fs.petsc_errors import brief, reason_name, translate
+from petsc_fs.petsc_errors import brief, translate
+from petsc_fs.refinement import PETSC_ATOL, Refinement
 from petsc_fs.result import Result
 from petsc_fs.scene import Scene
-from petsc_fs.system import EPS, FieldArrays, System, norm
+from petsc_fs.singular import attach, describe, null_vectors
+from petsc_fs.system import FieldArrays, System, norm
 
 __all__ = ["Result", "Solver"]
-
-MOST_PASSES = 20
-"""The Krylov method and its corrections; each has to halve what is missing."""
-NOT_FINITE = ("DIVERGED_NANORINF", "DIVERGED_PCSETUP_FAILED", "DIVERGED_PC_FAILED")
-"""PETSc's reasons that point at a level which broke down."""
 
 
 class Solver:
@@ -94,7 +89,7 @@ class Solver:
         self.left_out = self._chosen.left_out
         self._retry: _Retry | None = None
         with self._options():
-            self.system = System(self.layout, root_only=root_only, coordinates=needs_coordinates(prefix))
+            self.system = System(self.layout, root_only=root_only, near_null_space=needs_near_null_space(prefix))
             self.system.take(self._scene, release=release)
             self._forget_blocks()
             self.ksp = self._make_ksp(prefix)
@@ -214,6 +209,8 @@ class Solver:
         self.set_up()
         with self._options():
             result = self._run(self.ksp, wanted)
+            if not result.converged:
+                result = self._look_for_null_vectors(result, wanted)
         retry = PETSc.Options(self.prefix).getString("petsc_fs_retry", "none")
         if not result.converged and retry != "none":
             result = self._solve_again(retry, wanted, result)
@@ -225,7 +222,7 @@ class Solver:
         """The Krylov method and its corrections, and what comes of them. Collective."""
         started = time.perf_counter()
         system = self.system
-        run = _Run(system, ksp, wanted, self._atol if self._atol > PETSC_ATOL else 0.0)
+        run = Refinement(system, ksp, wanted, self._atol if self._atol > PETSC_ATOL else 0.0)
         try:
             run.first()
             run.correct()
@@ -253,6 +250,21 @@ class Solver:
             solve_seconds=time.perf_counter() - started,
             solution=solution,
             notes=run.notes,
+        )
+
+    def _look_for_null_vectors(self, result: Result, wanted: float) -> Result:
+        """Where a solve has failed as the system is singular, say so, and solve without its null space. Collective."""
+        vectors = null_vectors(self.system)
+        if not vectors:
+            return result
+        note = describe(self.system, vectors)
+        attach(self.system, self._matrix, vectors)
+        again = self._run(self.ksp, wanted)
+        return replace(
+            again,
+            iterations=result.iterations + again.iterations,
+            solve_seconds=result.solve_seconds + again.solve_seconds,
+            notes=(note + (". Solved for the solution without it" if again.converged else ""), *again.notes),
         )
 
     def _errors(self, solution: FieldArrays) -> dict[str, float]:
@@ -300,221 +312,6 @@ class Solver:
             _, _, (_, parts), _ = found
             parts.destroy()
             PETSc.garbage_cleanup(self.layout.comm)
-
-
-PETSC_ATOL = 1e-50
-"""PETSc's own absolute tolerance, which stands for none."""
-WELL_DETERMINED = 1e-3
-"""Estimated relative error of each field up to which a solution is taken as it is."""
-DETERMINED = 1e-2
-"""Relative correction of each field up to which a solution counts as one."""
-USUAL = 1e-5
-"""Least singular values of A M^-1 above this occur where only the units of fields differ; they cast no doubt."""
-CORRECTION = 1e-1
-"""Relative tolerance of a correction that measures the error."""
-
-
-class _Run:
-    """One solve: a Krylov method on the equilibrated system, and corrections as the user's system asks for them.
-
-    Attributes:
-        x: the solution so far, of the system as it is in PETSc.
-        check: how well it satisfies the user's system.
-        missing: by what factor it misses the tolerances.
-        goal: tolerance of the residual, relative to |b|.
-        field_goal: backward error that each field may have.
-        estimates: estimated relative error of each field.
-        is_determined: whether the equations determine the solution to `DETERMINED`.
-    """
-
-    def __init__(self, system: System, ksp: PETSc.KSP, rtol: float, atol: float) -> None:
-        self.system, self.ksp, self.rtol = system, ksp, rtol
-        self.x, self.r, self.d = (system.b.duplicate() for _ in range(3))
-        self.max_it = int(ksp.getTolerances()[3])
-        self.iterations = self.passes = 0
-        self.reason = "CONVERGED_ATOL"
-        self.history: list[NDArray[np.float64]] = []
-        self.notes: tuple[str, ...] = ()
-        self.estimates: dict[str, float] = {}
-        self.is_determined = True
-        self._weighted: PETSc.KSP | None = None
-        self.x.set(0.0)
-        self.check = system.check(self.x, self.r)
-        size = norm(self.check.rhs)
-        self.goal = max(rtol, math.ldexp(atol, system.rhs_scale) / size) if size else 1.0
-        self.field_goal = rtol
-        self.missing = self.check.excess(self.goal, self.field_goal) if size else 0.0
-
-    def first(self) -> None:
-        """The Krylov method by its options. Collective."""
-        if self.missing > 1.0:
-            self._pass(self.ksp, max(self.rtol, min(self.goal, 0.5)))
-            self.x.axpy(1.0, self.d)
-            self._judge()
-
-    def correct(self) -> None:
-        """Corrections, as long as each of them halves what is missing. Collective.
-
-        Rounding of the Krylov method's recursion, and norms: it may have stopped where a field has not.
-        """
-        if self.ksp.getType() == PETSc.KSP.Type.PREONLY:
-            return
-        while self.missing > 1.0 and self.passes < MOST_PASSES and self.iterations < self.max_it:
-            before, old = self.check, self.missing
-            self._pass(self._weigh(), 0.5)
-            self.x.axpy(1.0, self.d)
-            self._judge()
-            if self.missing > 0.5 * old:
-                if self.missing > old:
-                    self.x.axpy(-1.0, self.d)
-                    self.check, self.missing = before, old
-                    self.system.check(self.x, self.r)
-                return
-
-    def estimate_error(self) -> None:
-        """Estimate the error of each field, and where that casts doubt, measure it by a correction. Collective.
-
-        One application of the preconditioner to the residual is an estimate, over the least singular value that GMRES
-        has seen. A correction solves for the error itself, whatever the preconditioner is worth.
-        """
-        if self.missing > 1.0 or not self.passes:
-            return
-        try:
-            self.ksp.getPC().apply(self.r, self.d)
-        except (PETSc.Error, ImportError) as e:
-            raise translate(e, "the preconditioner failed") from None
-        least = 1.0
-        if self.ksp.getType() == PETSc.KSP.Type.GMRES and self.ksp.getIterationNumber():
-            seen = float(self.ksp.computeExtremeSingularValues()[1])
-            least = max(seen, EPS) if seen < USUAL else 1.0
-        self.estimates = {f: e / least for f, e in self._relative(self.d).items()}
-        if all(e <= WELL_DETERMINED for e in self.estimates.values()):
-            return
-        if self.ksp.getType() != PETSC_PREONLY and self.iterations < self.max_it:
-            self._pass(self._weigh(), CORRECTION)
-            self.estimates = self._relative(self.d)
-            old = self.missing
-            self.x.axpy(1.0, self.d)
-            self._judge()
-            if self.missing > max(1.0, old):
-                self.x.axpy(-1.0, self.d)
-                self._judge()
-        self.is_determined = all(e <= DETERMINED for e in self.estimates.values())
-        if not self.is_determined:
-            found = ", ".join(f"{f} {e:.0e}" for f, e in self.estimates.items() if not e <= DETERMINED)
-            self.notes += (
-                "ill-conditioned: the residual is small, but says little of the error, which is estimated at a part "
-                f"of the solution of {found}; at most {DETERMINED:g} counts as converged",
-            )
-
-    def _relative(self, part: PETSc.Vec) -> dict[str, float]:
-        """Size of each field of a vector beside that of the solution, or beside what would change any equation."""
-        sizes = self.system.norms(self.system.by_field(self.x))
-        least = self.system.least_sizes(self.check, self.field_goal)
-        found = self.system.norms(self.system.by_field(part))
-        return {f: n / (max(sizes[f], least[f]) or 1.0) for f, n in found.items()}
-
-    def _pass(self, ksp: PETSc.KSP, rtol: float) -> None:
-        """Run a Krylov method on the present residual; what it finds is in `d`. Collective."""
-        ksp.setTolerances(rtol=rtol, atol=0.0, max_it=max(self.max_it - self.iterations, 1))
-        try:
-            ksp.solve(self.r, self.d)
-        except (PETSc.Error, ImportError) as e:
-            raise translate(e, "solve failed") from None
-        self.passes += 1
-        self.iterations += ksp.getIterationNumber()
-        self.history.append(np.array(ksp.getConvergenceHistory()))
-        self.reason = reason_name(ksp)
-
-    def _judge(self) -> None:
-        """See where x stands. Collective.
-
-        Raises:
-            SolveError: it is not finite.
-        """
-        self.check = self.system.check(self.x, self.r)
-        self.missing = self.check.excess(self.goal, self.field_goal)
-        if not math.isfinite(self.missing):
-            where = broken_level(self.ksp.getPC())
-            raise SolveError(
-                f"the solution is not finite after {self.iterations} iterations ({self.reason})"
-                + (f"; {where}" if where else "")
-            )
-        if self.missing > 1.0:
-            self.check = self.system.check(self.x, self.r, exactly=True)
-            self.missing = self.check.excess(self.goal, self.field_goal)
-
-    def _weigh(self) -> PETSc.KSP:
-        """GMRES in the norm in which what is missing counts, with the preconditioner that is there. Collective."""
-        system, check = self.system, self.check
-        size = norm(check.rhs) * self.goal
-        weights = {}
-        for f, terms in check.terms.items():
-            own = self.field_goal * terms
-            wanted = own if check.rounded(f) else min(own, size)
-            weights[f] = 2.0 ** -system.row_scale[f] / wanted if wanted else 1.0
-        parts = [np.full(system.layout.sizes(f)[0], weights[f]) for f in system.layout.fields]
-        context = _Weighted(system.b.duplicate(), self._matrix, self.ksp.getPC())
-        context.w.setArray(np.concatenate(parts))
-        self._end_weighted()
-        comm = system.layout.comm
-        A = PETSc.Mat().createPython(self._matrix.getSizes(), context, comm=comm)
-        A.setUp()
-        ksp = PETSc.KSP().create(comm)
-        ksp.setOperators(A, A)
-        ksp.setType(PETSc.KSP.Type.GMRES)
-        ksp.setGMRESRestart(CORRECTION_RESTART)
-        ksp.setPCSide(PETSc.PC.Side.RIGHT)
-        ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
-        ksp.setConvergenceHistory(reset=True)
-        ksp.getPC().setType("python")
-        ksp.getPC().setPythonContext(context)
-        self._weighted, self._context = ksp, context
-        self.r.pointwiseMult(self.r, context.w)
-        return ksp
-
-    @property
-    def _matrix(self) -> PETSc.Mat:
-        return self.ksp.getOperators()[0]
-
-    def _end_weighted(self) -> None:
-        if self._weighted is not None:
-            self._weighted.destroy()
-            self._context.destroy()
-            self._weighted = None
-
-    def destroy(self) -> None:
-        """Collective."""
-        self._end_weighted()
-        for vector in (self.x, self.r, self.d):
-            vector.destroy()
-
-
-CORRECTION_RESTART = 60
-PETSC_PREONLY = PETSc.KSP.Type.PREONLY
-
-
-class _Weighted:
-    """The system with its rows multiplied by weights, and its preconditioner, which need not know of them."""
-
-    def __init__(self, w: PETSc.Vec, A: PETSc.Mat, M: PETSc.PC) -> None:
-        self.w, self.A, self.M = w, A, M
-        self.work = w.duplicate()
-
-    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Y = W A x. Collective."""
-        self.A.mult(x, y)
-        y.pointwiseMult(y, self.w)
-
-    def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Y = M^-1 W^-1 x. Collective."""
-        self.work.pointwiseDivide(x, self.w)
-        self.M.apply(self.work, y)
-
-    def destroy(self, *_: PETSc.Object) -> None:
-        """Collective; may be called several times."""
-        self.w.destroy()
-        self.work.destroy()
 
 
 class _Parts:
@@ -569,34 +366,10 @@ def _set_up(ksp: PETSc.KSP) -> None:
         raise translate(e, "set-up failed") from None
 
 
-def needs_coordinates(prefix: str) -> bool:
+def needs_near_null_space(prefix: str) -> bool:
     """Whether the solver in the options database makes use of rigid-body modes. Local."""
     chosen = {k: str(v) for k, v in PETSc.Options().getAll().items() if k.startswith(prefix)}
     types = {v for k, v in chosen.items() if k.endswith("pc_type")}
     foreign = any(k.endswith("pc_python_type") and not v.startswith("petsc_fs.pc.") for k, v in chosen.items())
     nodal = any(k.endswith(("boomeramg_nodal_coarsen", "boomeramg_vec_interp_variant")) for k in chosen)
     return nodal or foreign or bool(types & {"gamg", "ml", "bddc", "hmg"})
-
-
-def broken_level(pc: PETSc.PC) -> str:
-    """The innermost level of a set-up tree that turns ones into numbers that are not finite; "" if there is none.
-
-    Collective.
-    """
-    for part in reversed(list(nest.levels(pc))):
-        x, y = part.getOperators()[1].createVecs()
-        x.set(1.0)
-        y.set(0.0)
-        try:
-            part.apply(x, y)
-            what = "" if math.isfinite(y.norm()) else "turns ones into numbers that are not finite"
-        except PETSc.Error as e:
-            what = f"fails (error {e.ierr})"
-        for v in (x, y):
-            v.destroy()
-        if what:
-            kind, prefix = part.getType(), f"-{part.getOptionsPrefix() or ''}"
-            hint = f"; if it is MUMPS, raise {prefix}mat_mumps_icntl_14" if kind in ("lu", "cholesky") else ""
-            return f"level {prefix} ({kind}) {what}{hint}"
-    return ""
-

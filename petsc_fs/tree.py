@@ -14,7 +14,6 @@ import numpy as np
 
 from petsc_fs.errors import UsageError, together
 from petsc_fs.fields import FIELD_NAMES, MECHANICS
-from petsc_fs.fixed_stress import analytic_coefficients
 from petsc_fs.options import find_options_file, parse
 from petsc_fs.scene import Scene
 
@@ -142,7 +141,7 @@ class Facts:
             )
 
         with together(comm):
-            coefficients = analytic_coefficients(scene) if "mass" in scene.sizes else None
+            coefficients = scene.fixed_stress_coefficients() if "mass" in scene.sizes else None
         counts = np.array(
             [
                 entries(("contact",), ("intf_force",)),
