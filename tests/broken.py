@@ -374,7 +374,6 @@ def use(path: Path, file: Path | None, comm: MPI.Intracomm) -> str:
     """Read a scene, solve it and write what came out, as `petsc-fs solve` does. Collective."""
     from petsc4py import PETSc
 
-    from petsc_fs.cli.main import tree_for
     from petsc_fs.io.reader import read_distributed
     from petsc_fs.solver import Solver
 
@@ -385,7 +384,7 @@ def use(path: Path, file: Path | None, comm: MPI.Intracomm) -> str:
             new = options.insert_all(options.parse(file))
         scene, layout = read_distributed(path, comm, index_type=PETSc.IntType)
         if file is None:
-            new = options.insert_all(tree_for(scene, comm).options)
+            new = options.insert_all(options.choose(options.Facts.of(scene, comm)).values)
         solver = Solver(scene, comm, layout=layout)
         try:
             result = solver.solve()

@@ -9,7 +9,6 @@ from petsc4py import PETSc
 from test_server import on_rank_0
 
 from petsc_fs import options
-from petsc_fs.cli.main import tree_for
 from petsc_fs.errors import SceneError, UsageError
 from petsc_fs.fallback import RUNGS, leaves
 from petsc_fs.levels import levels
@@ -33,7 +32,11 @@ def solver(clean):
 
     def create(scene: Scene, file: str = TREE, prefix: str = "", **more: str) -> Solver:
         options.insert_all(more, prefix)
-        chosen = options.parse(options.find_options_file(file)) if file else tree_for(scene, comm).options
+        chosen = (
+            options.parse(options.find_options_file(file))
+            if file
+            else options.choose(options.Facts.of(scene, comm)).values
+        )
         options.insert_all(chosen, prefix)
         made.append(Solver(scene, comm, prefix=prefix))
         return made[-1]
@@ -218,7 +221,10 @@ def test_a_served_solver_falls_back_on_all_ranks(clean):
 
     def body(client) -> None:
         scene = load("base")
-        new = options.insert_all(tree_for(scene, SELF).options | {"ksp_max_it": "2", "petsc_fs_fallback": "monolithic"})
+        new = options.insert_all(
+            options.choose(options.Facts.of(scene, SELF)).values
+            | {"ksp_max_it": "2", "petsc_fs_fallback": "monolithic"}
+        )
         served = ServedSolver(client, scene)
         result = served.solve()
         assert result.converged and result.fallback == "monolithic"

@@ -9,7 +9,6 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petsc_fs import options
-from petsc_fs.cli.main import tree_for
 from petsc_fs.diagnostics import explain_weakness, transformed_contact_block
 from petsc_fs.errors import SceneError, UsageError
 from petsc_fs.layout import Layout
@@ -29,7 +28,11 @@ def solver(clean):
 
     def create(scene: Scene, file: str = "", **more: str) -> Solver:
         options.insert_all(more)
-        options.insert_all(options.parse(options.find_options_file(file)) if file else tree_for(scene, comm).options)
+        options.insert_all(
+            options.parse(options.find_options_file(file))
+            if file
+            else options.choose(options.Facts.of(scene, comm)).values
+        )
         return Solver(scene, comm)
 
     return create
