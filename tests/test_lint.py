@@ -55,7 +55,7 @@ BROKEN = {
     ),
     "no_number": (
         edited(GOOD, "-ksp_rtol 1e-10", "-ksp_rtol abc"),
-        ["mine.opts: ", "PETSc refuses", "Input string abc has no numeric value"],
+        ["mine.opts: -ksp_rtol abc: expected a number from 0 to below 1"],
     ),
     "no_ksp_type": (
         edited(GOOD, "-ksp_type preonly\n      -pc_type hypre", "-pc_type hypre"),
