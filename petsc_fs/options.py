@@ -32,7 +32,7 @@ Options = dict[str, str | None]
 
 SPLIT = r"(?<!pc_)fieldsplit_(?:intf_force|intf_flow|[A-Za-z]+|\d+)_"
 """The prefix of one split in an option name, but not PCFIELDSPLIT's own `pc_fieldsplit_0_fields`."""
-AT_THE_END = ("options_left", "options_view", "get_total_flops", "objects_view", "mpidump", "skip_petscrc")
+AT_THE_END = ("options_left", "options_view", "get_total_flops", "objects_view", "mpidump", "citations", "skip_petscrc")
 """Options that PETSc asks for only in PetscFinalize, or before anybody can see it."""
 ALLOW_UNUSED = "petsc_fs_allow_unused"
 """Option with patterns, such as `my_*`, of options that may do nothing, separated by commas."""
@@ -42,17 +42,9 @@ OWN = (
 )
 """Options that somebody may mean at the outermost level although no shipped file has them."""
 AT_ANY_LEVEL = (
-    *(
-        "ksp_type",
-        "ksp_rtol",
-        "ksp_atol",
-        "ksp_max_it",
-        "ksp_gmres_restart",
-        "pc_type",
-        "pc_fieldsplit_type",
-        "fs_type",
-    ),
-    *("fs_damping", "pc_hypre_type", "pc_hypre_boomeramg_strong_threshold", "pc_hypre_boomeramg_max_iter"),
+    *(f"ksp_{name}" for name in ("type", "rtol", "atol", "max_it", "gmres_restart")),
+    *(f"pc_{name}" for name in ("type", "fieldsplit_type", "hypre_type", "hypre_boomeramg_strong_threshold")),
+    *("fs_type", "fs_damping"),
 )
 """The same at any level."""
 NUMBERS: dict[str, tuple[float, float, bool]] = {

@@ -109,7 +109,7 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
         "converged": all(record["converged"] for record in records),
         "options_file": player.choice.file and player.choice.file.name if player.choice else given.files[0].name,
         "left_out": list(player.left_out),
-        "options": given_options(player.choice),
+        "options": options.database(),
         "versions": versions(),
         "memory_bytes": player.phases.report(comm),
     }
@@ -181,6 +181,7 @@ class Player:
         self.choice: Choice | None = None
         self.phases = Phases()
         self._facts: Facts | None = None
+        self._inserted: tuple[str, ...] = ()
         self._layout: Layout | None = None
 
     @property
@@ -229,30 +230,29 @@ class Player:
     def _solve(self, scene: Scene, layout: Layout, rtol: float | None) -> Result:
         from petsc_fs.solver import Solver
 
-        with self._options(scene):
-            if self.solver is None:
-                self.solver = Solver(scene, self.comm, layout=layout, release=True)
-            else:
-                self.solver.update(scene)
-            self.phases.end("build")
-            self.solver.set_up()
-            self.phases.end("set-up")
-            self.result = self.solver.solve(rtol)
+        if self.smallest:
+            self._choose(scene)
+        if self.solver is None:
+            self.solver = Solver(scene, self.comm, layout=layout, release=True)
+        else:
+            self.solver.update(scene)
+        self.phases.end("build")
+        self.solver.set_up()
+        self.phases.end("set-up")
+        self.result = self.solver.solve(rtol)
         self.phases.end("solve")
         return self.result
 
-    def _options(self, scene: Scene) -> contextlib.AbstractContextManager[None]:
+    def _choose(self, scene: Scene) -> None:
         """Have the options of the smallest solver in PETSc's database, for what the steps have shown so far."""
-        if not self.smallest:
-            return contextlib.nullcontext()
         facts = options.Facts.of(scene, self.comm)
         if self._facts is not None and self._facts.fields == facts.fields:
             facts = facts.or_either(self._facts)
         if facts != self._facts:
             self._forget_solver()
+            options.delete_all(self._inserted)
             self._facts, self.choice = facts, options.choose(facts)
-        assert self.choice is not None
-        return options.inserted(self.choice.values)
+            self._inserted = options.insert_all(self.choice.values)
 
     def solution(self) -> dict[str, Any] | None:
         """All rows of the last step's solution, on rank 0. Collective."""
@@ -276,11 +276,6 @@ def _verdict(result: Result) -> str:
     """The verdict in words, where the result has none."""
     found = f"true residual {result.true_relative_residual:.2e}, tolerance {result.tolerance:.2e}"
     return f"{'converged' if result.converged else 'NOT CONVERGED'}: {found}"
-
-
-def given_options(choice: Choice | None) -> dict[str, str | None]:
-    """The options of this run: those in PETSc's database, and where they leave it open those of the choice. Local."""
-    return (choice.values if choice is not None else {}) | options.database()
 
 
 def finite(value: Any) -> Any:
