@@ -74,9 +74,10 @@ def find_options_file(name: str) -> Path:
         UsageError: there is none, or it cannot be read.
     """
     path = Path(name)
-    if not path.exists() and (shipped_folder() / path.name).exists() and path.parent in (Path(), Path("options")):
+    here = path.parent in (Path(), Path("options"))
+    if here and not os.path.exists(path) and os.path.exists(shipped_folder() / path.name):
         path = shipped_folder() / path.name
-    if not path.is_file():
+    if not os.path.isfile(path):
         names = ", ".join(sorted(p.name for p in shipped_folder().glob("*.opts")))
         raise UsageError(f"options file {name}: no such file; shipped are {names}")
     if not os.access(path, os.R_OK):

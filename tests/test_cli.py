@@ -519,6 +519,7 @@ def test_nothing_that_is_read_or_asked_for_twice_is_written_over(tmp_path, monke
         ((Path("a"), None, tmp_path / "a"), "a: cannot be written: it is asked for twice"),
         ((Path("nowhere/a"),), "nowhere/a: the folder .* does not exist"),
         ((tmp_path,), "cannot be written: it is a folder"),
+        ((Path("x" * 256),), "cannot be written: it has too long a name"),
         *(((Path(name),), "pipe or device") for name in ("/dev/null", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1")),
     ):
         with pytest.raises(UsageError, match=message):

@@ -24,7 +24,7 @@ def find_scene(name: str) -> Path:
         SceneError: there is neither, or what is there is a pipe or device.
     """
     path, there = Path(name), bundled()
-    if path.exists():
+    if os.path.exists(path):  # False where a folder may not be looked into, or the name is too long
         if not (path.is_file() or path.is_dir()):
             raise SceneError(f"{path}: a pipe or device, not a scene; copy it into a file first")
         return path
@@ -46,23 +46,30 @@ def check_targets(*targets: Path | None, sources: Iterable[Path] = ()) -> None:
         UsageError: a folder is missing or not to be written to, something else than a file is in the way, or it is a
             source, or two are the same.
     """
-    taken = {source.resolve(): "is what is read, and would be lost" for source in sources}
+    taken = {source.resolve(): "it is what is read, and would be lost" for source in sources}
     for target in targets:
         if target is None:
             continue
         folder = target.absolute().parent
-        if not folder.is_dir():
+        if not os.path.isdir(folder):
             raise UsageError(f"{target}: the folder {folder} does not exist")
+        why = taken.get(target.resolve(), "")
         if not os.access(folder, os.W_OK):
-            raise UsageError(f"{target}: cannot be written: no permission to write into {folder}")
-        of_the_system = folder.resolve() == Path("/dev") or folder.resolve().parts[1:2] == ("proc",)
-        if of_the_system or (target.exists() and not target.is_file()):
-            raise UsageError(
-                f"{target}: cannot be written: it is a {'folder' if target.is_dir() else 'pipe or device'}"
-            )
-        if target.resolve() in taken:
-            raise UsageError(f"{target}: cannot be written: it {taken[target.resolve()]}")
-        taken[target.resolve()] = "is asked for twice"
+            why = f"there is no permission to write into {folder}"
+        elif os.path.isdir(target):
+            why = "it is a folder"
+        elif (os.path.exists(target) and not os.path.isfile(target)) or _of_the_system(folder):
+            why = "it is a pipe or device"
+        elif len(os.fsencode(target.name)) > os.pathconf(folder, "PC_NAME_MAX"):
+            why = "it has too long a name"
+        if why:
+            raise UsageError(f"{target}: cannot be written: {why}")
+        taken[target.resolve()] = "it is asked for twice"
+
+
+def _of_the_system(folder: Path) -> bool:
+    """Whether what is in a folder are devices or open files, under the names of files."""
+    return folder.resolve() == Path("/dev") or folder.resolve().parts[1:2] == ("proc",)
 
 
 def versions() -> dict[str, str]:
