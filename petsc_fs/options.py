@@ -13,7 +13,7 @@ import re
 import signal
 import sysconfig
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -37,7 +37,7 @@ AT_THE_END = ("options_left", "options_view", "get_total_flops", "objects_view",
 ALLOW_UNUSED = "petsc_fs_allow_unused"
 """Option with patterns, such as `my_*`, of options that may do nothing, separated by commas."""
 OWN = (
-    *(f"petsc_fs_{name}" for name in ("mat_type", "partition", "ordering", "retry", "on_failure", "forcing")),
+    *(f"petsc_fs_{name}" for name in ("partition", "ordering", "retry", "on_failure", "forcing")),
     *(ALLOW_UNUSED, "qr_side", "ksp_monitor", "ksp_monitor_true_residual", "ksp_view", "ksp_converged_reason"),
 )
 """Options that somebody may mean at the outermost level although no shipped file has them."""
@@ -120,6 +120,21 @@ def read_header(path: Path) -> OptionsFile:
         default=entries.get("default") == "yes",
         not_for=tuple(re.findall(r"\w+", entries.get("not_for", ""))),
     )
+
+
+def fitting_file(name: str, fields: Iterable[str]) -> Path:
+    """An options file, see `find_options_file`, that is for scenes with these fields.
+
+    Raises:
+        UsageError: there is no such file, or it is for others.
+    """
+    header = read_header(find_options_file(name))
+    if not header.fits(fields):
+        raise UsageError(
+            f"{header.path.name} is for scenes with the fields {', '.join(header.fields)}; "
+            f"this one has {', '.join(in_order(fields))}"
+        )
+    return header.path
 
 
 def shipped() -> list[OptionsFile]:
@@ -245,7 +260,7 @@ WITHOUT_HYPRE = "contact_poromechanics_gamg.opts"
 REST = "qr_fieldsplit_1_"
 STRESS = tuple(f"{REST}fieldsplit_1_{name}" for name in ("fs_type", "fs_damping", "pc_python_type"))
 LEFT_OUT: dict[str, tuple[str, ...]] = {
-    "no contact: Q_r and the first Schur level left out": ("qr_side", "qr_fieldsplit_contact_"),
+    "no contact: Q_r and the first Schur level left out": ("qr_side", "qr_mechanics_", "qr_fieldsplit_contact_"),
     "no mechanics: the second Schur level with fixed stress left out": (f"{REST}fieldsplit_mechanics_", *STRESS),
     "no flow: the second and third Schur levels left out": (f"{REST}fieldsplit_1_",),
     "mechanics and flow decoupled: fixed stress left out": STRESS,
@@ -316,9 +331,9 @@ class Choice:
         left_out: what of the canonical solver is not there, a line each.
     """
 
-    values: Options
-    file: Path | None
-    left_out: tuple[str, ...]
+    values: Options = field(default_factory=dict)
+    file: Path | None = None
+    left_out: tuple[str, ...] = ()
 
     def text(self, title: str) -> str:
         """An options file, with a comment for each part left out."""
@@ -372,8 +387,8 @@ def cut(canonical: Mapping[str, str | None], facts: Facts) -> Options:
     if mechanics:
         leaf = _under(level_2, "fieldsplit_mechanics_")
         names = ["mechanics"] if transform else list(mechanics)
-        if len(names) > 1:
-            outer["petsc_fs_mat_type"] = "aij"  # multigrid takes both fields as one matrix
+        if len(names) > 1 and leaf.get("pc_type") != "python":
+            leaf = {"pc_type": "python", "pc_python_type": "petsc_fs.pc.Assembled", **_put("assembled_", leaf)}
         exact = not (facts.flow_moves_rock or facts.rock_moves_flow)
         node = _split(level_2, names, leaf, node, members, additive=exact) if members else leaf
         members = [*names, *members]
@@ -382,8 +397,7 @@ def cut(canonical: Mapping[str, str | None], facts: Facts) -> Options:
         node = _split(level_1, ["contact"], leaf, node, members) if members else leaf
     node.pop("ksp_type", None)
     if transform:
-        python = {name: value for name, value in canonical.items() if name in ("pc_type", "pc_python_type", "qr_side")}
-        node = python | _put("qr_", node)
+        node = {k: v for k, v in canonical.items() if k.startswith(("pc_", "qr_side", "qr_mech"))} | _put("qr_", node)
     return outer | node
 
 
@@ -391,7 +405,7 @@ def _split(
     level: Options, first: list[str], leaf: Options, rest: Options, members: list[str], *, additive: bool = False
 ) -> Options:
     """A level that takes the first fields apart from the others, block-diagonal where that is exact."""
-    own = {name: value for name, value in level.items() if not name.startswith(("fieldsplit_", "side"))}
+    own = {name: value for name, value in level.items() if name.startswith("pc_")}
     if additive:
         own = {name: value for name, value in own.items() if not name.startswith("pc_fieldsplit_schur")}
         own["pc_fieldsplit_type"] = "additive"
@@ -475,25 +489,6 @@ def inserted(values: Path | Mapping[str, str | None], prefix: str = "") -> Itera
         yield
     finally:
         delete_all(new)
-
-
-@contextlib.contextmanager
-def replaced(values: Mapping[str, str | None]) -> Iterator[None]:
-    """Have options in PETSc's database within a block, in place of those that are set there. Local."""
-    from petsc4py import PETSc
-
-    database = PETSc.Options()
-    before = database.getAll()
-    for name, value in values.items():
-        database.setValue(name, value)
-    try:
-        yield
-    finally:
-        for name in values:
-            if name in before:
-                database.setValue(name, before[name])
-            else:
-                database.delValue(name)
 
 
 def number(name: str, default: Number, prefix: str = "") -> Number:
@@ -613,19 +608,6 @@ class Given:
         check(values)
         files = [find_options_file(b) for a, b in itertools.pairwise(words) if a.lstrip("-") == "options_file"]
         return cls(frozenset(word.lstrip("-") for word in words if is_option(word)), values, tuple(files))
-
-    def fit(self, fields: Iterable[str]) -> None:
-        """Complain about a file for other fields. Local.
-
-        Raises:
-            UsageError: the first one is.
-        """
-        for header in map(read_header, self.files[:1]):
-            if not header.fits(fields):
-                raise UsageError(
-                    f"{header.path.name} is for scenes with the fields {', '.join(header.fields)}; "
-                    f"this one has {', '.join(in_order(fields))}"
-                )
 
     def start(self, *, files: bool = True, petscrc: bool = False) -> None:
         """Initialise PETSc with these options, if it is not yet; else put them into its database. Collective.

@@ -9,7 +9,6 @@ from sample import SCENES, csr, dense
 
 from petsc_fs.cli.main import main
 from petsc_fs.errors import SceneError
-from petsc_fs.fixed_stress import analytic_coefficients
 from petsc_fs.io import hdf5
 from petsc_fs.scene import CSR, Material, Scene
 from petsc_fs.tools.contraction import contact_rows, contraction_rate, coupling_term, evaluate, korn_trace
@@ -246,7 +245,7 @@ def richardson(scene, iterations):
     volume = scene.cell_volumes["mass"]
     scale = volume * rho / scene.material.time_step
     rock, fracture = (scene.cell_dimension == scene.dimension - i for i in (0, 1))
-    fixed = analytic_coefficients(scene)[:, 0]  # gamma_c in fractures
+    fixed = scene.fixed_stress_coefficients()[:, 0]  # gamma_c in fractures
     S = J[k:, k:].copy()
     S[range(-cells, 0), range(-cells, 0)] += np.where(rock, alpha**2 / lame * scale, fixed)
     solve_mechanics, solve_flow = direct(J[:k, :k]), direct(S)

@@ -82,7 +82,7 @@ BROKEN = {
         edited(POROMECHANICS, "  -fs_pc_type", "  -fs_type analitic\n  -fs_pc_type"),
         ["-fieldsplit_mass_fs_type analitic: expected analytic or algebraic"],
     ),
-    "wrong_storage": ("-petsc_fs_mat_type nested\n", ["-petsc_fs_mat_type nested: expected nest or merged or aij"]),
+    "wrong_partition": ("-petsc_fs_partition nested\n", ["-petsc_fs_partition nested: expected auto or "]),
     "no_text": (b"\x89HDF\xff\xfe\x00", ["mine.opts: not readable as text"]),
 }
 

@@ -16,7 +16,6 @@ from petsc_fs import options
 from petsc_fs.cli import main as cli
 from petsc_fs.errors import SceneError
 from petsc_fs.fallback import RUNGS
-from petsc_fs.fixed_stress import analytic_coefficients
 from petsc_fs.io import hdf5
 from petsc_fs.solver import Solver
 from petsc_fs.tools import reference, stress
@@ -128,7 +127,7 @@ def test_rows_are_scaled_by_powers_of_two_and_the_solution_stays(solve):
 @pytest.mark.mpi
 def test_without_any_storage_fixed_stress_has_its_limit(solve):
     scene = load("no_storage")
-    coefficients = analytic_coefficients(scene)
+    coefficients = scene.fixed_stress_coefficients()
     assert np.isfinite(coefficients).all()
     assert solve(scene).converged
 

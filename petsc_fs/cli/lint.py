@@ -9,7 +9,6 @@ from pathlib import Path
 from petsc_fs import options
 from petsc_fs.errors import PetscFsError, UsageError
 from petsc_fs.io import hdf5
-from petsc_fs.levels import levels
 
 
 def lint(file: Path, scenes: Sequence[Path]) -> list[str]:
@@ -39,6 +38,7 @@ def lint(file: Path, scenes: Sequence[Path]) -> list[str]:
         raise UsageError(f"{file}: none of the scenes has the fields {', '.join(header.fields)}; name one")
 
     options.Given.of(["-options_file", str(file)]).start()
+    from petsc_fs.nest import levels
     from petsc_fs.solver import Solver
 
     found = [f"{file}: {problem}" for problem in _levels_without_types(chosen)]

@@ -24,8 +24,8 @@ from petsc_fs.memory import Phases, return_freed
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from petsc_fs.layout import Layout
     from petsc_fs.options import Choice, Facts
+    from petsc_fs.partition import Layout
     from petsc_fs.scene import Scene
     from petsc_fs.solver import Result, Solver
 
@@ -39,7 +39,6 @@ PETSc options follow the scene, for example
   -petsc_fs_retry FILE   options file for a second solve, where the first one fails
   -petsc_fs_partition rcb    which rank gets which cells: auto, rcb, ptscotch or contiguous
   -petsc_fs_ordering morton  order of the cells of a rank: auto, natural (that of the file), or along a curve
-  -petsc_fs_mat_type aij     one assembled matrix instead of blocks, for direct solvers
   -petsc_fs_allow_unused my_*   names of options that may do nothing
 
 exit codes: 0 converged, by the residual of the system in the file; 1 not converged, or the solve
@@ -93,7 +92,8 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
         check_targets(args.report, args.save, sources=(path, *given.files))
         if args.save is not None and len(steps) > 1:
             raise UsageError("--save: writes the solution of one step; choose it with --steps K")
-        given.fit(steps[0].sizes)
+        if given.files:
+            options.fitting_file(str(given.files[0]), steps[0].sizes)
     given.start(petscrc=args.petscrc)
     return_freed()
     smallest = not given.files or "pc_type" not in given.values
@@ -209,13 +209,10 @@ class Player:
         meta = scene.metadata
         about = {name: getattr(meta, name) for name in ("model", "time_step_index", "newton_index")}
         known = {"dimension": scene.dimension, "fields": sizes, **about} if step.index is None else {}
-        verdict = getattr(result, "verdict", None) or _verdict(result)
-        return step.record | known | {"read_seconds": read_seconds, **result.report(), "verdict": verdict}
+        return step.record | known | {"read_seconds": read_seconds, **result.report()}
 
     def _read(self, step: Step) -> tuple[Scene, Layout]:
         """The part of this rank of one step; cells stay on their ranks as long as the fields keep their sizes."""
-        from petsc4py import PETSc
-
         from petsc_fs.io.reader import read_distributed
         from petsc_fs.partition import chosen
 
@@ -223,8 +220,8 @@ class Player:
         if layout is not None and {f: layout.sizes(f)[1] for f in layout.fields} != step.sizes:
             layout = None
             self._forget_solver()
-        more: dict[str, Any] = {"layout": layout, "index_type": PETSc.IntType, "find": step.find}
-        self.scene, self._layout = read_distributed(self.path, self.comm, *chosen(), **more)
+        how = chosen()
+        self.scene, self._layout = read_distributed(self.path, self.comm, *how, layout=layout, find=step.find)
         return self.scene, self._layout
 
     def _solve(self, scene: Scene, layout: Layout, rtol: float | None) -> Result:
@@ -270,12 +267,6 @@ class Player:
         if self.solver is not None:
             self.solver.destroy()
             self.solver = None
-
-
-def _verdict(result: Result) -> str:
-    """The verdict in words, where the result has none."""
-    found = f"true residual {result.true_relative_residual:.2e}, tolerance {result.tolerance:.2e}"
-    return f"{'converged' if result.converged else 'NOT CONVERGED'}: {found}"
 
 
 def finite(value: Any) -> Any:

@@ -51,13 +51,20 @@ def solve_table(report: dict[str, Any]) -> str:
     residuals, backward, errors = (
         report.get(f"{name}_by_field") or {} for name in ("residual", "backward_error", "error")
     )
+    estimates = {} if errors else report.get("estimated_error_by_field") or {}
     rows: list[Sequence[object]] = [
-        (f, f"{n:,}", *(_number(found.get(f)) for found in (residuals, backward, errors)))
+        (f, f"{n:,}", *(_number(found.get(f)) for found in (residuals, backward, errors or estimates)))
         for f, n in report["fields"].items()
     ]
     total = sum(report["fields"].values())
     rows += [(), ("all", f"{total:,}", _number(report["true_relative_residual"]), "", "")]
-    headings = ["field", "unknowns", "residual", "backward error" if backward else "", "error" if errors else ""]
+    headings = [
+        "field",
+        "unknowns",
+        "residual",
+        "backward error",
+        "error" if errors else "error, estimated" if estimates else "",
+    ]
     source = report["options_file"] or "the smallest solver for the scene"
     lines = [
         report["verdict"],
@@ -67,7 +74,7 @@ def solve_table(report: dict[str, Any]) -> str:
         _seconds(report),
         memory.text(report["memory_bytes"]),
     ]
-    return "\n".join([_title(report, report["scene"]), "", table(headings, rows), "", wrapped(lines)])
+    return "\n".join([wrapped([_title(report, report["scene"])]), "", table(headings, rows), "", wrapped(lines)])
 
 
 def sequence_table(report: dict[str, Any]) -> str:
@@ -98,7 +105,7 @@ def sequence_table(report: dict[str, Any]) -> str:
         memory.text(report["memory_bytes"]),
     ]
     body = table([*headings, "st./sl./open" if contact else ""], rows, left="")
-    return "\n".join([f"{report['sequence']}: {report['model']}", "", body, "", wrapped(lines)])
+    return "\n".join([wrapped([f"{report['sequence']}: {report['model']}"]), "", body, "", wrapped(lines)])
 
 
 def run_table(summary: dict[str, Any]) -> str:
@@ -180,7 +187,7 @@ def scene_table(scene: Scene) -> str:
     heading = "entries of each block, and the least and greatest |a_ij|; '.' is an empty block"
     about = {"dimension": scene.dimension} | vars(scene.metadata)
     matrix = table(["", *scene.fields], blocks)
-    return "\n".join([_title(about, ""), "", *fields, "", heading, matrix, "", wrapped(lines)])
+    return "\n".join([wrapped([_title(about, "")]), "", *fields, "", heading, matrix, "", wrapped(lines)])
 
 
 def _block_text(scene: Scene, r: str, c: str) -> tuple[str, str]:
