@@ -14,7 +14,6 @@ from sample import CELLS, full_scene
 
 from petsc_fs import options
 from petsc_fs.cli import main as cli
-from petsc_fs.cli.main import tree_for
 from petsc_fs.errors import SceneError
 from petsc_fs.fallback import RUNGS
 from petsc_fs.io import hdf5
@@ -49,7 +48,7 @@ def solve():
     def run(scene, **more):
         for name, value in more.items():
             PETSc.Options().setValue(name, value)
-        new = options.insert_all(tree_for(scene, comm).options)
+        new = options.insert_all(options.choose(options.Facts.of(scene, comm)).values)
         inserted.extend([*new, *more])
         try:
             return Solver(scene, comm).solve()

@@ -405,8 +405,8 @@ def find_cases(names: Sequence[str]) -> list[Case]:
         SceneError: one is missing or no scene.
         UsageError: two have the same name.
     """
-    from petsc_fs.cli.main import find_scene
     from petsc_fs.io import hdf5
+    from petsc_fs.io.bundled import find_scene
 
     cases = []
     for path in dict.fromkeys(find_scene(name) for name in names):
@@ -705,7 +705,7 @@ def _interruptible() -> Iterator[None]:
 
 def _measure_all(args: argparse.Namespace, petsc: list[str]) -> Comparison:
     """Measure what the command line asks for, with live progress."""
-    from petsc_fs.cli.main import versions
+    from petsc_fs.io.bundled import versions
     from petsc_fs.tools.compare_page import Progress
 
     more_ranks, more = split_petsc(petsc)

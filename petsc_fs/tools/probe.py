@@ -151,9 +151,7 @@ class Probe:
         self.read_seconds = self._slowest(MPI.Wtime() - started)
         self.read_cpu = self._slowest(time.process_time() - cpu)
         if self.job.options_file is None:
-            from petsc_fs.cli.main import tree_for
-
-            self._insert(tree_for(self.scene, self.comm).options)
+            self._insert(options.choose(options.Facts.of(self.scene, self.comm)).values)
         options.insert_all({"options_left": "no"})
         reset_peak()
         self.base = self.comm.allgather(resident())

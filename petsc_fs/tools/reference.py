@@ -312,11 +312,11 @@ def _iterative(scene: Scene, matrix: CSR) -> Iterator[tuple[Solve, str]]:
     """The Krylov solver for the scene: its solve, and what it is."""
     from mpi4py import MPI
 
-    from petsc_fs.cli.main import tree_for
+    from petsc_fs.options import Facts, choose
     from petsc_fs.solver import Solver
 
     tolerances = {"ksp_rtol": str(INNER_RTOL), "ksp_atol": "0", "petsc_fs_restarts": "0", "ksp_max_it": "500"}
-    with inserted({**tree_for(scene, MPI.COMM_SELF).options, **tolerances}, PREFIX):
+    with inserted({**choose(Facts.of(scene, MPI.COMM_SELF)).values, **tolerances}, PREFIX):
         solver = Solver(scene, MPI.COMM_SELF, prefix=PREFIX)
 
         def correct(residual: Floats) -> Floats:

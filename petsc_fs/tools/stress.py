@@ -343,9 +343,9 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
     """Run `petsc-fs stress`."""
     if comm.size > 1:
         raise UsageError("stress starts mpiexec itself: call it without, and give it -n RANKS")
-    from petsc_fs.cli.main import check_folders
+    from petsc_fs.io.bundled import check_targets
 
-    check_folders(args.report, args.page, args.limits)
+    check_targets(args.report, args.page, args.limits)
     numbers, more = split_petsc(petsc)
     cases = _chosen(args)
     if args.list:
