@@ -28,7 +28,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -129,15 +129,16 @@ def solve(scene: Scene, method: str = "auto", scene_digest: str = "") -> Referen
     return Reference(solution, words, tuple(corrections), backward_error(scene, solution, exact), scene_digest)
 
 
-def one_block(scene: Scene) -> CSR:
-    """The whole Jacobian in compressed rows, fields one after the other."""
-    start = dict(zip(scene.fields, np.cumsum([0, *(scene.sizes[f] for f in scene.fields)]), strict=False))
-    n = sum(scene.sizes.values())
-    row = np.concatenate([start[r] + rows_of(block) for (r, _), block in scene.blocks.items()])
-    column = np.concatenate([start[c] + block.indices for (_, c), block in scene.blocks.items()])
+def one_block(scene: Scene, fields: Sequence[str] = ()) -> CSR:
+    """The whole Jacobian in compressed rows, or that of some fields, one field after the other."""
+    names = fields or scene.fields
+    start = dict(zip(names, np.cumsum([0, *(scene.sizes[f] for f in names)]), strict=False))
+    blocks = {(r, c): block for (r, c), block in scene.blocks.items() if {r, c} <= set(names)}
+    row = np.concatenate([start[r] + rows_of(block) for (r, _), block in blocks.items()])
+    column = np.concatenate([start[c] + block.indices for (_, c), block in blocks.items()])
     order = np.lexsort((column, row))
-    indptr = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=n))])
-    return CSR(indptr, column[order], np.concatenate([b.data for b in scene.blocks.values()])[order])
+    indptr = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=sum(scene.sizes[f] for f in names)))])
+    return CSR(indptr, column[order], np.concatenate([b.data for b in blocks.values()])[order])
 
 
 def rows_of(block: CSR) -> NDArray[np.int64]:
