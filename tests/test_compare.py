@@ -31,7 +31,7 @@ def record(file: str, rtol: float | None, seconds: float, error: float | None, *
 
 def comparison(records: list[dict[str, Any]], **more: Any) -> Comparison:
     reference = {"method": "LU", "corrections": [1.0, 1e-20], "backward_error": {"componentwise": 1e-16}}
-    case = Case("box", "box.h5", 2, dict(FIELDS), "a box", 1, reference)
+    case = Case("box", "box.h5", 2, dict(FIELDS), "a box", reference=reference)
     files = tuple(dict.fromkeys(r["variant"] for r in records))
     variants = tuple(Variant(f, f, purpose=f"what {f} is", text="-ksp_type gmres <&>\n") for f in files)
     about = {"date": "2026-01-01 00:00", "complete": True}
@@ -128,7 +128,7 @@ def test_ratios_are_medians_of_those_within_each_round() -> None:
     assert point.ratios["total"].median == pytest.approx(0.5)  # 1/2, 1.5/3, 10/20
     assert point.ratios["setup"].median == 1.0
     rows = compare.ratio_rows(found, compare.points(found))
-    assert rows[1][8] == "0.50 [0.50, 0.50]" and rows[-1][8] == "0.50, worst 0.50"
+    assert rows[1][8] == "0.5 [0.5, 0.5]" and rows[-1][8] == "0.50, worst 0.50"
     assert rows[1][9] == "100"
 
 

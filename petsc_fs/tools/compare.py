@@ -14,6 +14,7 @@ import itertools
 import json
 import os
 import re
+import signal
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -33,7 +34,6 @@ from petsc_fs.tools.measure import (
     Variant,
     describe_machine,
     grown,
-    interruptible,
     measure_all,
     seconds_of,
     split_ranks,
@@ -53,25 +53,15 @@ SECONDS = {"total": "set-up and solve", "solve": "solve alone"}
 
 @dataclass(frozen=True)
 class Case:
-    """A scene or sequence to compare on.
+    """A scene or sequence to compare on."""
 
-    Attributes:
-        label: what pictures call it: the name of the file.
-        path: of the file.
-        dimension: of the rock matrix.
-        sizes: unknowns of each field, in the first step of a sequence.
-        model: where it comes from.
-        steps: number of systems in it.
-        reference: what is known of the accuracy of the reference, see `petsc_fs.tools.reference.Reference.about`.
-    """
-
-    label: str
+    label: str  # the name of the file
     path: str
     dimension: int
-    sizes: dict[str, int]
-    model: str
-    steps: int = 1
-    reference: dict[str, Any] = field(default_factory=dict)
+    sizes: dict[str, int]  # unknowns of each field, in the first step of a sequence
+    model: str  # where it comes from
+    steps: int = 0  # of a sequence
+    reference: dict[str, Any] = field(default_factory=dict)  # see `petsc_fs.tools.reference.Reference.about`
 
     @classmethod
     def of(cls, path: Path) -> Case:
@@ -99,29 +89,17 @@ class Case:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All that was measured, and what with.
-
-    Attributes:
-        cases: scenes.
-        variants: options files; the first one is the base, if there is one.
-        ranks: numbers of ranks.
-        rtols: tolerances, from the loosest; empty for those of the files.
-        repeat: rounds.
-        records: see `petsc_fs.tools.measure`.
-        about: command, machine and date.
-        clock: what seconds are, one of `petsc_fs.tools.measure.CLOCKS`.
-        base: label of the variant that others are compared to; "" for none.
-    """
+    """All that was measured, and what with."""
 
     cases: tuple[Case, ...]
     variants: tuple[Variant, ...]
     ranks: tuple[int, ...]
-    rtols: tuple[float, ...]
-    repeat: int
-    records: list[Record]
-    about: dict[str, Any]
-    clock: str = "wall"
-    base: str = ""
+    rtols: tuple[float, ...]  # from the loosest; empty for those of the files
+    repeat: int  # rounds
+    records: list[Record]  # see `petsc_fs.tools.measure`
+    about: dict[str, Any]  # command, machine and date
+    clock: str = "wall"  # what seconds are, one of `petsc_fs.tools.measure.CLOCKS`
+    base: str = ""  # label of the variant that others are compared to; "" for none
 
     def to_json(self) -> str:
         """Everything, for `from_json`."""
@@ -158,32 +136,20 @@ class Spread:
 
 @dataclass(frozen=True)
 class Point:
-    """What one file did with one tolerance on one scene and number of ranks, over all rounds.
-
-    Attributes:
-        scene, file, ranks, rtol: what was measured.
-        ended: whether every round came to a solution.
-        converged: whether every round met the tolerance.
-        iterations: median.
-        error: forward error, median; NaN where there is no reference.
-        residual: true residual, median.
-        seconds: of "read", "setup", "solve", and "total" of the last two.
-        ratios: of "setup", "solve" and "total" to those of the base file in the same round.
-        memory: bytes that all ranks' memory grew by, median.
-    """
+    """What one file did with one tolerance on one scene and number of ranks, over all rounds: medians."""
 
     scene: str
     file: str
     ranks: int
     rtol: float | None
-    ended: bool
-    converged: bool
+    ended: bool  # whether every round came to a solution
+    converged: bool  # whether every round met the tolerance
     iterations: float
-    error: float
-    residual: float
-    seconds: dict[str, Spread]
-    ratios: dict[str, Spread]
-    memory: float
+    error: float  # forward error; NaN where there is no reference
+    residual: float  # true residual
+    seconds: dict[str, Spread]  # of "read", "setup", "solve", and "total" of the last two
+    ratios: dict[str, Spread]  # of "setup", "solve" and "total" to those of the base file in the same round
+    memory: float  # bytes that all ranks' memory grew by
 
 
 def points(found: Comparison) -> list[Point]:
@@ -226,17 +192,11 @@ def points(found: Comparison) -> list[Point]:
 
 @dataclass(frozen=True)
 class Fastest:
-    """The fastest file for an accuracy.
-
-    Attributes:
-        file: its label.
-        seconds: median of its fastest point whose error is not above the accuracy.
-        ties: other files whose quartiles overlap with its own, from the fastest.
-    """
+    """The fastest file for an accuracy."""
 
     file: str
-    seconds: float
-    ties: tuple[str, ...]
+    seconds: float  # median of its fastest point whose error is not above the accuracy
+    ties: tuple[str, ...]  # other files whose quartiles overlap with its own, from the fastest
 
     def __str__(self) -> str:
         ties = f" (≈ {', '.join(self.ties)})" if self.ties else ""
@@ -299,23 +259,18 @@ def ratio_rows(found: Comparison, everything: Sequence[Point]) -> list[list[obje
     rows: list[list[object]] = []
     means: dict[tuple[int, str], list[float]] = {}
     for p in everything:
+        ratios = ["–"] * 3
         if p.ratios:
             means.setdefault((p.ranks, p.file), []).append(p.ratios["total"].median)
-        shown = [f"{p.ratios[w].median:.2f}" if p.ratios else "–" for w in ("setup", "solve")]
-        total = (
-            f"{p.ratios['total'].median:.2f} [{p.ratios['total'].low:.2f}, {p.ratios['total'].high:.2f}]"
-            if p.ratios
-            else "–"
-        )
-        tolerance = "" if p.rtol is None else f" to {p.rtol:.0e}"
+            ratios = [f"{p.ratios[w].median:.2f}" for w in ("setup", "solve")] + [str(p.ratios["total"])]
+        scene = p.scene if p.rtol is None else f"{p.scene} to {p.rtol:.0e}"
+        file = p.file if p.converged else f"{p.file} (not converged)"
         seconds = [f"{p.seconds[w].median:.3g}" for w in ("setup", "solve")]
-        said = "" if p.converged else " (not converged)"
-        memory = f"{p.memory / 2**20:.3g}"
-        rows.append([p.scene + tolerance, p.ranks, p.file + said, f"{p.iterations:g}", *seconds, *shown, total, memory])
+        rows.append([scene, p.ranks, file, f"{p.iterations:g}", *seconds, *ratios, f"{p.memory / 2**20:.3g}"])
     for (ranks, file), values in sorted(means.items()):
-        mean = f"{np.exp(np.mean(np.log(values))):.2f}, worst {max(values):.2f}"
         if file != found.base:
-            rows.append(["geometric mean", ranks, file, "", "", "", "", "", mean, ""])
+            mean = f"{np.exp(np.mean(np.log(values))):.2f}, worst {max(values):.2f}"
+            rows.append(["geometric mean", ranks, file, *[""] * 5, mean, ""])
     return rows
 
 
@@ -412,7 +367,7 @@ def page(found: Comparison, everything: Sequence[Point], pictures: Mapping[str, 
         lines += ["<h2>Which file is fastest for which accuracy</h2>", hypertext(SUMMARY, best)]
     for case in found.cases:
         sizes = ", ".join(f"{name} {size:,}" for name, size in case.sizes.items())
-        steps = f"{case.steps} steps; " if case.steps > 1 else ""
+        steps = f"{case.steps} steps; " if case.steps else ""
         about = f"{case.model}, {case.dimension}D; {steps}{sum(case.sizes.values()):,} unknowns: {sizes}."
         lines += [
             f"<h2>{html.escape(case.label)}</h2>",
@@ -565,41 +520,34 @@ def _measure(args: argparse.Namespace, petsc: list[str]) -> Comparison:
     if args.out is not None:
         _make_folder(args.out)
     started, complete, records = time.time(), True, list[Record]()
-    references: dict[str, Path] = {}
+    references: dict[str, str] = {}
     by_path = {case.path: case for case in cases}
-    with interruptible():
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # batch systems send it when time is up
+    try:
         for k, case in enumerate(cases if rtols and args.out is not None else ()):
-            if case.steps == 1:
-                references[case.path] = args.out / f"reference_{case.label}.npz"
+            if not case.steps:
                 _say(f"reference solution of {case.label}")
-                cases[k] = replace(case, reference=reference.made(case.path, references[case.path]).about())
-        job = Job(
-            rtols=rtols,
-            warm_up=True,
-            errors=bool(references),
-            references={k: os.fspath(v) for k, v in references.items()},
-            time_limit=args.time_limit,
-        )
-        processes = measure_all(
+                references[case.path] = os.fspath(args.out / f"reference_{case.label}.npz")
+                cases[k] = replace(case, reference=reference.made(case.path, Path(references[case.path])).about())
+        for found in measure_all(
             list(by_path),
             variants,
-            job,
+            Job(rtols=rtols, warm_up=True, errors=True, references=references, time_limit=args.time_limit),
             ranks=ranks,
             repeat=args.repeat,
             fits=lambda system, variant: variant.fits(tuple(by_path[system].sizes), by_path[system].names),
             mpiexec=args.mpiexec,
-        )
-        try:
-            for found in processes:
-                records += found
-                for r in found:
-                    if r["kind"] != "converged":
-                        where = f"{by_path[r['scene']].label}, {r['variant']}, {r['ranks']} ranks"
-                        _say(f"{where}: {r['kind']} {r['message'] or r['reason']}")
-        except KeyboardInterrupt:
-            if not records:
-                raise
-            complete = False
+        ):
+            records += found
+            for r in (r for r in found if r["kind"] != "converged"):
+                where = f"{by_path[r['scene']].label}, {r['variant']}, {r['ranks']} rank(s)"
+                _say(f"{where}: {r['kind']} {r['message'] or r['reason']}")
+    except KeyboardInterrupt:
+        if not records:
+            raise
+        complete = False
+    finally:
+        signal.signal(signal.SIGTERM, before)
     about = {
         "command": " ".join(["petsc-fs", *sys.argv[1:]]),
         "date": time.strftime("%Y-%m-%d %H:%M", time.localtime(started)),
@@ -608,10 +556,8 @@ def _measure(args: argparse.Namespace, petsc: list[str]) -> Comparison:
         "load average at the end": os.getloadavg()[2],
         **describe_machine(),
     }
-    base = variants[0].label if args.base else ""
-    return Comparison(
-        tuple(cases), tuple(variants), ranks, rtols, args.repeat, records, about, args.clock or "wall", base
-    )
+    how = {"clock": args.clock or "wall", "base": variants[0].label if args.base else ""}
+    return Comparison(tuple(cases), tuple(variants), ranks, rtols, args.repeat, records, about, **how)
 
 
 def _variants(

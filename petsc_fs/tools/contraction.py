@@ -413,7 +413,8 @@ def _largest_compliance(scene: Scene, rows: ContactRows) -> float:
             for _step in range(POWER_STEPS):
                 force = np.zeros(sum(scene.sizes[f] for f in fields))
                 np.add.at(force, row_of, jump.data * (root * x / np.linalg.norm(x))[jump.indices])
-                x = root * np.bincount(jump.indices, jump.data * inverse(force)[row_of], root.size).astype(np.float64)
+                opening = np.bincount(jump.indices, jump.data * inverse(force)[row_of], root.size)
+                x = np.asarray(root * opening, dtype=np.float64)
                 before, largest = largest, float(np.linalg.norm(x))
                 if not np.isfinite(largest):
                     raise SceneError("the walls of the fractures can move without force")

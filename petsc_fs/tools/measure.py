@@ -36,6 +36,7 @@ Times are the slowest rank's. Where a solve crashes, records of those before it 
 from __future__ import annotations
 
 import ctypes
+import itertools
 import json
 import os
 import platform
@@ -48,7 +49,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -112,36 +112,20 @@ def grown(record: Record) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """What one process measures: each scene, with each tolerance, repeated.
+    """What one process measures: each scene, with each tolerance, repeated."""
 
-    Attributes:
-        scenes: files; sequences are replayed as a run would solve them.
-        options_file: path; None for the default solver of each scene, as `petsc-fs solve` chooses it.
-        options: further PETSc options without the dash, which win over the file; None where there is no value.
-        ranks: number of MPI ranks.
-        rtols: relative tolerances, solved for with one set-up; they win over -ksp_rtol and -ksp_atol, which is then 0.
-            Empty: as the options say.
-        repetitions: set-ups and solves of each scene.
-        warm_up: whether one more set-up and solve goes before, unrecorded, so that no time goes to loading libraries.
-        errors: whether backward errors are computed; forward errors too where there is a reference.
-        references: scene to a file of `petsc_fs.tools.reference.write`.
-        time_limit: seconds for each step: start and reading, set-up, one solve, errors.
-        memory_limit: bytes of address space that each rank may have; None for what the system allows.
-        keep_going: whether the process goes on with the next scene after an error that all ranks raised.
-    """
-
-    scenes: Sequence[Path_] = ()
-    options_file: Path_ | None = None
-    options: Mapping[str, str | None] = field(default_factory=dict)
+    scenes: Sequence[Path_] = ()  # files; sequences are replayed as a run would solve them
+    options_file: Path_ | None = None  # None for the default solver of each scene, as `petsc-fs solve` chooses it
+    options: Mapping[str, str | None] = field(default_factory=dict)  # without the dash, which win over the file
     ranks: int = 1
-    rtols: Sequence[float] = ()
-    repetitions: int = 1
-    warm_up: bool = False
-    errors: bool = False
-    references: Mapping[str, Path_] = field(default_factory=dict)
-    time_limit: float = 300.0
-    memory_limit: int | None = None
-    keep_going: bool = False
+    rtols: Sequence[float] = ()  # of solves after one set-up; they win over -ksp_rtol and -ksp_atol, which is then 0
+    repetitions: int = 1  # set-ups and solves of each scene
+    warm_up: bool = False  # whether an unrecorded solve goes before, so that no time goes to loading libraries
+    errors: bool = False  # whether backward errors are computed; forward errors too where there is a reference
+    references: Mapping[str, Path_] = field(default_factory=dict)  # scene to file of `petsc_fs.tools.reference.write`
+    time_limit: float = 300.0  # seconds for each step: start and reading, set-up, one solve, errors
+    memory_limit: int | None = None  # bytes of address space that each rank may have
+    keep_going: bool = False  # whether the next scene follows after an error that all ranks raised
 
     def to_json(self) -> str:
         """What the measured process reads."""
@@ -155,25 +139,15 @@ class Job:
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to solve: an options file, perhaps with further options.
+    """One way to solve: an options file, perhaps with further options."""
 
-    Attributes:
-        label: what tables call it.
-        path: of the file; "" for the default solver of each scene.
-        options: without the dash, which win over the file.
-        fields: that a scene must have; empty if any will do.
-        not_for: models that it is known to fail on.
-        purpose: first line of the file.
-        text: the file, verbatim.
-    """
-
-    label: str
-    path: str = ""
-    options: Mapping[str, str | None] = field(default_factory=dict)
-    fields: tuple[str, ...] = ()
-    not_for: tuple[str, ...] = ()
-    purpose: str = ""
-    text: str = ""
+    label: str  # what tables call it
+    path: str = ""  # of the file; "" for the default solver of each scene
+    options: Mapping[str, str | None] = field(default_factory=dict)  # without the dash, which win over the file
+    fields: tuple[str, ...] = ()  # that a scene must have; empty if any will do
+    not_for: tuple[str, ...] = ()  # models that it is known to fail on
+    purpose: str = ""  # first line of the file
+    text: str = ""  # the file, verbatim
 
     @classmethod
     def of(cls, words: str, more: Mapping[str, str | None] | None = None) -> Variant:
@@ -186,15 +160,9 @@ class Variant:
         path = options_files.find_options_file(name)
         options_files.parse(path)
         header = options_files.read_header(path)
-        return cls(
-            label=" ".join([path.stem, *own]),
-            path=str(path),
-            options={**(more or {}), **petsc_options(own)},
-            fields=header.fields,
-            not_for=header.not_for,
-            purpose=header.purpose,
-            text=path.read_text(encoding="utf-8"),
-        )
+        label, chosen = " ".join([path.stem, *own]), {**(more or {}), **petsc_options(own)}
+        text = path.read_text(encoding="utf-8")
+        return cls(label, str(path), chosen, header.fields, header.not_for, header.purpose, text)
 
     def fits(self, fields: Sequence[str], names: Sequence[str] = ()) -> bool:
         """Whether it is for a scene with these fields, known by these names, as far as its header says."""
@@ -254,7 +222,7 @@ def measure_all(
         job: all that is the same; scenes, options and ranks are put in.
         ranks: numbers of ranks.
         repeat: rounds.
-        fits: whether a variant is to be measured on a system; by default always.
+        fits: whether a variant is to be measured on a system.
         batch: whether a process takes all systems, one after the other, and not one alone.
         mpiexec: program that starts ranks.
 
@@ -264,27 +232,24 @@ def measure_all(
     """
     names = [os.fspath(s) for s in systems]
     hung: set[tuple[str, str, int]] = set()
-    for number in range(repeat):
-        for group in [names] if batch else [[name] for name in names]:
-            for n in ranks:
-                shift = number % max(len(variants), 1)
-                for variant in [*variants[shift:], *variants[:shift]]:
-                    left = [s for s in group if fits(s, variant) and (s, variant.label, n) not in hung]
-                    while left:
-                        mine = replace(
-                            job,
-                            scenes=left,
-                            options_file=variant.path or None,
-                            options=variant.options,
-                            ranks=n,
-                            references={s: job.references[s] for s in left if s in job.references},
-                        )
-                        what = {"variant": variant.label, "ranks": n, "round": number}
-                        found = [r | what for r in measure(mine, mpiexec=mpiexec)]
-                        hung |= {(r["scene"], variant.label, n) for r in found if r["kind"] == "hang"}
-                        yield found
-                        done = {r["scene"] for r in found}
-                        left = [s for s in left if s not in done]
+    groups = [names] if batch else [[name] for name in names]
+    for number, group, n in itertools.product(range(repeat), groups, ranks):
+        shift = number % max(len(variants), 1)
+        for v in [*variants[shift:], *variants[:shift]]:
+            left = [s for s in group if fits(s, v) and (s, v.label, n) not in hung]
+            while left:
+                references = {s: job.references[s] for s in left if s in job.references}
+                what: dict[str, Any] = {
+                    "options_file": v.path or None,
+                    "options": v.options,
+                    "ranks": n,
+                    "references": references,
+                }
+                found = measure(replace(job, scenes=left, **what), mpiexec=mpiexec)
+                hung |= {(r["scene"], v.label, n) for r in found if r["kind"] == "hang"}
+                yield [r | {"variant": v.label, "ranks": n, "round": number} for r in found]
+                done = {r["scene"] for r in found}
+                left = [s for s in left if s not in done]
 
 
 def measure(job: Job, *, mpiexec: Path_ | None = None) -> list[Record]:
@@ -454,31 +419,13 @@ def describe_machine() -> dict[str, str]:
     """Processor, cores, memory, system and versions that measurements were made with."""
     from petsc_fs.io import hdf5
 
-    model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        names = re.findall(r"^model name\s*: (.*)$", cpuinfo.read_text(encoding="utf-8"), flags=re.MULTILINE)
-        model = names[0] if names else model
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    said = cpuinfo.read_text(encoding="utf-8") if cpuinfo.exists() else ""
+    model = re.findall(r"^model name\s*: (.*)$", said, flags=re.MULTILINE) or [platform.processor()]
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     return {
-        "processor": f"{model}, {cores} core{'s' if cores > 1 else ''}",
-        "memory": f"{memory:.0f} GiB",
+        "processor": f"{model[0]}, {os.cpu_count()} cores, {memory:.0f} GiB",
         "system": f"{platform.system()} {platform.release()}",
         "threads per rank": environment()["OMP_NUM_THREADS"],
         "versions": ", ".join(f"{name} {number}" for name, number in hdf5.versions().items()),
     }
-
-
-@contextmanager
-def interruptible() -> Iterator[None]:
-    """Let SIGTERM, which batch systems send when time is up, do what Ctrl-C does."""
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

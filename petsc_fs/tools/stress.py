@@ -66,28 +66,18 @@ RETRY = "(default, retry)"
 
 @dataclass(frozen=True)
 class Truth:
-    """What is known of a case before anything is solved.
-
-    Attributes:
-        name, group, hard, source, singular, solvable, held_out: see `petsc_fs.tools.stress_cases.StressCase`.
-        fields: of the scene.
-        unknowns: number of them.
-        path: of the scene.
-        reference: file of the reference solution; "" if there is none.
-        no_reference: why.
-        conditions: see `petsc_fs.tools.reference.field_conditions`.
-    """
+    """What is known of a case before anything is solved; see `petsc_fs.tools.stress_cases.StressCase` for the rest."""
 
     name: str
     group: str
     hard: str
     source: str
-    fields: tuple[str, ...]
-    unknowns: int
-    path: str
-    reference: str
-    no_reference: str
-    conditions: dict[str, float]
+    fields: tuple[str, ...]  # of the scene
+    unknowns: int  # number of them
+    path: str  # of the scene
+    reference: str  # file of the reference solution; "" if there is none
+    no_reference: str  # why
+    conditions: dict[str, float]  # see `petsc_fs.tools.reference.field_conditions`
     singular: bool
     solvable: bool = True
     held_out: bool = False
@@ -95,35 +85,20 @@ class Truth:
 
 @dataclass(frozen=True)
 class Finding:
-    """What came of one case with one options file on some ranks.
+    """What came of one case with one options file on some ranks."""
 
-    Attributes:
-        case: its name.
-        file: name of the options file, or `DEFAULT` or `RETRY`.
-        ranks: number of them.
-        outcome: one of `OUTCOMES`.
-        kind: of `petsc_fs.tools.measure.KINDS`.
-        message: what was said.
-        iterations: of the outer Krylov method.
-        reason: why it stopped.
-        error_by_field: relative, in natural norms.
-        allowed_by_field: the largest errors that count as right.
-        backward_error: normwise, componentwise and fieldwise.
-        seconds: set-up and solve.
-    """
-
-    case: str
-    file: str
+    case: str  # its name
+    file: str  # name of the options file, or DEFAULT or RETRY
     ranks: int
-    outcome: str
-    kind: str
-    message: str
-    iterations: int | None
-    reason: str | None
-    error_by_field: dict[str, float] | None
-    allowed_by_field: dict[str, float]
-    backward_error: dict[str, float] | None
-    seconds: float | None
+    outcome: str  # one of OUTCOMES
+    kind: str  # of `petsc_fs.tools.measure.KINDS`
+    message: str  # what was said
+    iterations: int | None  # of the outer Krylov method
+    reason: str | None  # why it stopped
+    error_by_field: dict[str, float] | None  # relative, in natural norms
+    backward_error: dict[str, float] | None  # normwise, componentwise and fieldwise
+    allowed_by_field: dict[str, float]  # the largest errors that count as right
+    seconds: float | None  # set-up and solve
 
 
 def prepare(cases: Iterable[StressCase], folder: Path) -> list[Truth]:
@@ -146,23 +121,12 @@ def prepare(cases: Iterable[StressCase], folder: Path) -> list[Truth]:
                 conditions = reference.field_conditions(scene, exact.solution)
         except (SolveError, FloatingPointError) as e:
             why = str(e)
-        found.append(
-            Truth(
-                name=case.name,
-                group=case.group,
-                hard=case.hard,
-                source=case.source,
-                fields=scene.fields,
-                unknowns=sum(scene.sizes.values()),
-                path=os.fspath(path),
-                reference="" if case.singular else target,
-                no_reference=why,
-                conditions=conditions,
-                singular=case.singular,
-                solvable=case.solvable,
-                held_out=case.held_out,
-            )
-        )
+        same: dict[str, Any] = {
+            name: getattr(case, name) for name in "name group hard source singular solvable held_out".split()
+        }
+        known: dict[str, Any] = {"fields": scene.fields, "unknowns": sum(scene.sizes.values()), "path": os.fspath(path)}
+        target = "" if case.singular else target
+        found.append(Truth(**same, **known, reference=target, no_reference=why, conditions=conditions))
     return found
 
 
@@ -189,15 +153,11 @@ def run(
     by_path = {t.path: t for t in truths}
     references = {t.path: t.reference for t in truths if t.reference}
     job = Job(errors=True, references=references, time_limit=time_limit, keep_going=True)
-    processes = measure_all(
-        list(by_path),
-        chosen,
-        job,
-        ranks=ranks,
-        fits=lambda system, variant: variant.fits(by_path[system].fields),
-        batch=True,
-        mpiexec=mpiexec,
-    )
+
+    def fits(system: str, variant: Variant) -> bool:
+        return variant.fits(by_path[system].fields)
+
+    processes = measure_all(list(by_path), chosen, job, ranks=ranks, fits=fits, batch=True, mpiexec=mpiexec)
     for records in processes:
         found = [judge(by_path[record["scene"]], record) for record in records]
         numbers = Counter(f.outcome for f in found)
@@ -222,20 +182,9 @@ def judge(truth: Truth, record: Record) -> Finding:
     else:
         backward = (record["backward_error"] or {}).get("fieldwise", np.inf)
         outcome = "right" if backward <= SINGULAR_BACKWARD else "wrong"
-    return Finding(
-        case=truth.name,
-        file=record["variant"],
-        ranks=record["ranks"],
-        outcome=outcome,
-        kind=kind,
-        message=record["message"],
-        iterations=record["iterations"],
-        reason=record["reason"],
-        error_by_field=errors,
-        allowed_by_field=allowed,
-        backward_error=record["backward_error"],
-        seconds=None if record["seconds"] is None else seconds_of(record)["total"],
-    )
+    said = {key: record[key] for key in "ranks kind message iterations reason error_by_field backward_error".split()}
+    seconds = None if record["seconds"] is None else seconds_of(record)["total"]
+    return Finding(truth.name, record["variant"], outcome=outcome, allowed_by_field=allowed, seconds=seconds, **said)
 
 
 def report(truths: Sequence[Truth], findings: Sequence[Finding], command: str) -> dict[str, Any]:

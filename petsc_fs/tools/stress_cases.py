@@ -10,6 +10,7 @@ under random transformations.
 
 from __future__ import annotations
 
+import json
 import lzma
 import tempfile
 from collections.abc import Callable, Mapping
@@ -64,126 +65,26 @@ def lame(ratio: float, shear_modulus: float = 1.2e10) -> dict[str, float]:
     return {"shear_modulus": shear_modulus, "lame_lambda": 2 * shear_modulus * ratio / (1 - 2 * ratio)}
 
 
-def _stiffness(factor: float) -> dict[str, float]:
-    return {"shear_modulus": 1.2e10 * factor, "lame_lambda": 1.2e10 * factor}
-
-
 def opening(width: float) -> dict[str, float]:
     """Rock data for fractures of a width in m."""
     return {"residual_aperture": width, "fracture_gap": width, "maximum_elastic_fracture_opening": width / 2}
 
 
-def _crosses(number: int) -> tuple[tuple[float, float, float, float], ...]:
-    """Fractures along lines of a 10 by 10 grid that cross each other two by two."""
-    found = []
-    for k in range(number // 2):
-        x, y = 0.1 + 0.2 * (k % 5), 0.2 + 0.3 * (k // 5)
-        found += [(max(x - 0.1, 0.0), y, x + 0.1, y), (x, y - 0.1, x, y + 0.1)]
-    return tuple(tuple(round(v, 1) for v in line) for line in found)  # type: ignore[misc]
+CONTACT, FLOW, UNITS, ALGEBRA, HELD = "contact", "flow", "units", "algebra", "held out"
 
 
-CONTACT, FLOW, ROCK, TIME, SHAPE, UNITS, ALGEBRA, HELD = (
-    "contact", "flow", "rock and coupling", "time", "geometry", "units", "algebra", "held out",
-)  # fmt: skip
+def _frozen(value: Any) -> Any:
+    return tuple(map(_frozen, value)) if isinstance(value, list) else value
 
-# fmt: off
-RECIPES: dict[str, Recipe] = {
-    "base": Recipe(CONTACT, "nothing: the second Newton step of model 2, which the others vary"),
-    "friction_0": Recipe(CONTACT, "no friction: tangential rows lose all traction of their own",
-        parameters={"friction": 0.0}),
-    "friction_0.01": Recipe(CONTACT, "tangential rows nearly without traction", parameters={"friction": 0.01}),
-    "friction_0.1": Recipe(CONTACT, "most cells slide", parameters={"friction": 0.1}),
-    "friction_0.8": Recipe(CONTACT, "high friction couples normal and tangential", parameters={"friction": 0.8}),
-    "friction_1.5": Recipe(CONTACT, "friction above 1: the tangential rows are dominated by normal traction",
-        parameters={"friction": 1.5}),
-    "kn_0": Recipe(CONTACT, "rigid fracture walls: no elastic opening", parameters={"normal_stiffness": 0.0}),
-    "kn_1.2e5": Recipe(CONTACT, "walls 1e4 times softer", parameters={"normal_stiffness": 120000.0}),
-    "kn_1.2e12": Recipe(CONTACT, "walls 1e3 times stiffer", parameters={"normal_stiffness": 1200000000000.0}),
-    "kn_1.2e16": Recipe(CONTACT, "walls 1e7 times stiffer", parameters={"normal_stiffness": 1.2e+16}),
-    "kn_1.2e20": Recipe(CONTACT, "walls 1e11 times stiffer", parameters={"normal_stiffness": 1.2e+20}),
-    "first_step": Recipe(CONTACT, "first Newton step: traction and jump are zero everywhere", step=(1, 0)),
-    "flip_2": Recipe(CONTACT, "states flipped since the Newton step before", step=(1, 2)),
-    "flip_3": Recipe(CONTACT, "second time step, second Newton step: states flipped once more", step=(2, 1)),
-    "sticking": Recipe(CONTACT, "all cells stick: the contact block is singular everywhere",
-        parameters={"friction": 100.0}, case={"traction": 30000000.0}),
-    "sliding": Recipe(CONTACT, "all cells slide",
-        parameters={"friction": 0.0001}, case={"traction": 3000000.0, "shear": 3000000.0}),
-    "open": Recipe(CONTACT, "all cells open: fractures carry no traction",
-        case={"traction": -30000000.0, "pressure_ratio": 1.0}),
-    "contact_constant_1e-6": Recipe(CONTACT, "constant c of the contact conditions 1e6 times smaller",
-        twist={"contact_constant": 1e-06}),
-    "contact_constant_1e6": Recipe(CONTACT, "constant c 1e6 times larger", twist={"contact_constant": 1000000.0}),
-    "characteristic_displacement_1e-7": Recipe(CONTACT, "traction scaled 1e6 times smaller, its unknowns larger",
-        rock={"characteristic_displacement": 1e-07}),
-    "characteristic_displacement_1e5": Recipe(CONTACT, "traction scaled 1e6 times larger, its unknowns smaller",
-        step=(1, 0), rock={"characteristic_displacement": 100000.0}),
-    "permeability_1e-22": Recipe(FLOW, "rock all but impermeable: contrast to fractures 1e22",
-        model="model1", rock={"permeability": 1e-22}),
-    "permeability_1e-18": Recipe(FLOW, "contrast of rock and fractures 1e18",
-        model="model1", rock={"permeability": 1e-18}),
-    "permeability_1e-8": Recipe(FLOW, "rock like gravel: flow dominates storage",
-        model="model1", rock={"permeability": 1e-08}),
-    "uniform_permeability": Recipe(FLOW, "fractures no better than rock",
-        model="model1", parameters={"fracture_permeability": "constant"}),
-    "cubic_law": Recipe(FLOW, "fracture permeability follows the opening",
-        model="model1", parameters={"fracture_permeability": "cubic"}),
-    "normal_permeability_1e-18": Recipe(FLOW, "fracture walls all but tight",
-        model="model1", rock={"normal_permeability": 1e-18}),
-    "normal_permeability_1e6": Recipe(FLOW, "fracture walls without resistance",
-        model="model1", rock={"normal_permeability": 1000000.0}),
-    "lognormal": Recipe(FLOW, "permeability scattered over 6 decades from cell to cell",
-        model="model1", twist={"lognormal": 6.0}),
-    "lognormal_12": Recipe(FLOW, "permeability scattered over 12 decades from cell to cell",
-        model="model1", twist={"lognormal": 12.0}),
-    "aperture_1e-8": Recipe(FLOW, "hairline fractures: cells of the fracture with a volume of 1e-8",
-        model="model1", parameters={"fracture_permeability": "cubic"}, rock=opening(1e-08)),
-    "aperture_1e-1": Recipe(FLOW, "wide fractures by the cubic law",
-        model="model1", parameters={"fracture_permeability": "cubic"}, rock=opening(0.1)),
-    "poisson_0.49": Recipe(ROCK, "nearly incompressible rock, Poisson's ratio 0.49",
-        model="model1", step=(1, 0), rock=lame(0.49)),
-    "poisson_0.4999": Recipe(ROCK, "nearly incompressible rock, Poisson's ratio 0.4999",
-        model="model1", step=(1, 0), rock=lame(0.4999)),
-    "stiffness_1e-6": Recipe(ROCK, "rock like mud: E 1e6 times smaller", model="model1", rock=_stiffness(1e-06)),
-    "stiffness_1e6": Recipe(ROCK, "E 1e6 times larger", model="model1", step=(1, 0), rock=_stiffness(1000000.0)),
-    "biot_0": Recipe(ROCK, "Biot coefficient 0: rock and flow act one way only, through fractures",
-        model="model1", step=(1, 0), rock={"biot_coefficient": 0.0, "storage": 1e-11}),
-    "biot_1e-3": Recipe(ROCK, "Biot coefficient 1e-3, less than the porosity: 1/M by the usual formula is negative",
-        model="model1", step=(1, 0), rock={"biot_coefficient": 0.001, "storage": 1e-11}),
-    "biot_1": Recipe(ROCK, "Biot coefficient 1: 1/M vanishes", model="model1", rock={"biot_coefficient": 1.0}),
-    "incompressible_fluid": Recipe(ROCK, "incompressible fluid, c_f = 0",
-        model="model1", rock={"fluid_compressibility": 0.0}),
-    "no_storage_of_rock": Recipe(ROCK, "1/M = 0", model="model1", rock={"storage": 0.0}),
-    "no_storage": Recipe(ROCK, "c_f = 0 and 1/M = 0: the pressure block loses its storage",
-        model="model1", rock={"biot_coefficient": 1.0, "fluid_compressibility": 0.0}),
-    "no_storage_tight": Recipe(ROCK, "no storage and no permeability: a saddle point",
-        model="model1", rock={"biot_coefficient": 1.0, "fluid_compressibility": 0.0, "permeability": 1e-22}),
-    "time_step_1e-6": Recipe(TIME, "time step of 1e-6 s: undrained", model="model1", case={"time_step": 1e-06}),
-    "time_step_1": Recipe(TIME, "time step of 1 s", model="model1", case={"time_step": 1.0}),
-    "time_step_1e6": Recipe(TIME, "time step of 1e6 s", model="model1", case={"time_step": 1000000.0}),
-    "time_step_1e10": Recipe(TIME, "time step of 1e10 s: steady flow",
-        model="model1", case={"time_step": 10000000000.0}),
-    "undrained_saddle": Recipe(TIME, "time step of 1e-6 s without storage: the pressure block nearly vanishes",
-        model="model1", rock={"biot_coefficient": 1.0, "fluid_compressibility": 0.0}, case={"time_step": 1e-06}),
-    "slivers": Recipe(SHAPE, "domain 1 km by 1 m: cells of aspect ratio 1e3",
-        model="model1", step=(1, 0), twist={"squeezed": 0.001}),
-    "near_parallel": Recipe(SHAPE, "two fractures half a degree and 10 m apart",
-        case={"fractures": ((0.4, 0.5, 0.6, 0.5), (0.4, 0.51, 0.6, 0.512))}),
-    "near_touching": Recipe(SHAPE, "a gap of 2 m between two fractures",
-        case={"fractures": ((0.2, 0.5, 0.5, 0.5), (0.502, 0.5, 0.8, 0.6))}),
-    "acute_crossing": Recipe(SHAPE, "two fractures crossing at less than two degrees",
-        case={"fractures": ((0.46, 0.5, 0.54, 0.5), (0.46, 0.4985, 0.54, 0.5015))}),
-    "one_cell": Recipe(SHAPE, "a fracture of one cell", case={"fractures": ((0.5, 0.5, 0.53, 0.5),)}),
-    "at_boundary": Recipe(SHAPE, "a fracture that ends on the boundary",
-        step=(1, 0), case={"fractures": ((0.0, 0.5, 0.5, 0.5),)}),
-    "cut_through": Recipe(SHAPE, "a fracture through the whole domain: one half is held by contact alone",
-        case={"fractures": ((0.0, 0.5, 1.0, 0.5),)}),
-    "thirty_fractures": Recipe(SHAPE, "30 fractures with 15 intersections",
-        refinement=1.0, case={"fractures": _crosses(30)}, twist={"cartesian": True}),
-    "three_planes": Recipe(SHAPE, "3D, three lines of intersection that meet in a point",
-        model="model3", refinement=0.2, twist={"planes": True}),
-}
+
+def _read_recipes() -> dict[str, Recipe]:
+    text = COLLECTION.with_name("recipes.json").read_text(encoding="utf-8")
+    frozen = json.loads(text, object_hook=lambda found: {k: _frozen(v) for k, v in found.items()})
+    return {name: Recipe(**known) for name, known in frozen.items()}
+
+
+RECIPES = _read_recipes()
 """Name of an exported scene to what it is made by."""
-# fmt: on
 
 
 @cache

@@ -166,23 +166,14 @@ def front(points: Sequence[Sequence[float]]) -> list[int]:
 
 @dataclass(frozen=True)
 class Attempt:
-    """One finished trial.
+    """One finished trial."""
 
-    Attributes:
-        number: of the trial.
-        values: of its parameters.
-        outcome: one of `OUTCOMES`.
-        message: one line on what went wrong.
-        scenes: by name of the scene, what was measured, with `ratios` to the base file.
-        same_as: number of the earlier trial that tried the same options, and was not measured again.
-    """
-
-    number: int
-    values: dict[str, Value]
-    outcome: str
-    message: str
-    scenes: dict[str, Summary]
-    same_as: int | None
+    number: int  # of the trial
+    values: dict[str, Value]  # of its parameters
+    outcome: str  # one of OUTCOMES
+    message: str  # one line on what went wrong
+    scenes: dict[str, Summary]  # by name of the scene, what was measured, with `ratios` to the base file
+    same_as: int | None  # number of an earlier trial of the same options, for which this one was not measured again
 
     @classmethod
     def of(cls, trial: Any) -> Attempt:
