@@ -17,9 +17,7 @@ import fcntl
 import json
 import math
 import os
-import shutil
 import statistics
-import subprocess
 import sys
 import time
 import warnings
@@ -32,10 +30,10 @@ from typing import TYPE_CHECKING, Any
 from petsc_fs import options
 from petsc_fs.errors import SolveError, UsageError
 from petsc_fs.io import hdf5
-from petsc_fs.io.files import complete, write_text
+from petsc_fs.io.files import write_text
 from petsc_fs.tools import measure
 from petsc_fs.tools.pages import markdown
-from petsc_fs.tools.space import ABSENT, Space, Value, find_space, read
+from petsc_fs.tools.space import Space, Value, find_space, label, read
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -445,36 +443,33 @@ class Sweep:
 
     def _compare(self, numbers: Sequence[int], scenes: Sequence[Path]) -> dict[int, dict[str, Summary]]:
         """Files of trials against the base file, measured in turns: medians of time ratios, by trial and scene."""
-        settings = self.settings
-        variants = [measure.Variant("", str(settings.space.base))]
-        variants += [measure.Variant(str(n), str(self._file(n))) for n in numbers]
-        found: dict[int, dict[str, Summary]] = {n: {} for n in numbers}
+        settings, found = self.settings, {n: dict[str, Summary]() for n in numbers}
+        variants = [measure.Variant(str(n), str(self._file(n))) for n in numbers]
+        variants.insert(0, measure.Variant("", str(settings.space.base)))
         for scene in scenes:
             self.say(f"base file against the best on {scene.name}, {settings.confirm} times")
-            rounds: dict[tuple[str, int], list[measure.Record]] = {}
-            for records in measure.measure_all(
-                [scene], variants, self._job(scene), ranks=(settings.ranks,), repeat=settings.confirm
-            ):
-                rounds[records[0]["variant"], records[0]["round"]] = records
-            base = {
-                k: summary(r, settings.clock)
-                for (v, k), r in rounds.items()
-                if not v and judge(r, NOTHING)[0] == "solved"
-            }
+            how: dict[str, Any] = {"ranks": (settings.ranks,), "repeat": settings.confirm}
+            processes = list(measure.measure_all([scene], variants, self._job(scene), **how))
+            rounds = {(records[0]["variant"], records[0]["round"]): records for records in processes}
+            mine = {key: records for key, records in rounds.items() if not key[0]}
+            base = {k: summary(r, settings.clock) for (_, k), r in mine.items() if judge(r, NOTHING)[0] == "solved"}
             if not base:
                 raise SolveError(f"the base file does not solve {scene.name} any more")
             for n in numbers:
-                mine = {k: rounds[str(n), k] for k in base if (str(n), k) in rounds}
-                bad = [(o, m) for o, m in (judge(r, base[k]) for k, r in mine.items()) if o != "solved"]
+                good: dict[int, Summary] = {}
                 entry: Summary = {"outcome": "solved", "message": "", "base": _median(list(base.values()))}
-                if bad or not mine:
-                    outcome, message = bad[0] if bad else ("hang", "no result in the first round")
-                    found[n][scene.name] = entry | {"outcome": outcome, "message": message}
-                    continue
-                known = {k: summary(r, settings.clock) for k, r in mine.items()}
-                pairs = [s["seconds"] / base[k]["seconds"] for k, s in known.items()]
-                entry |= _median(list(known.values())) | {"spread": [min(pairs), max(pairs)]}
-                entry["ratios"] = ratios(entry, entry["base"]) | {"time": statistics.median(pairs)}
+                for k, records in ((k, rounds[str(n), k]) for k in base if (str(n), k) in rounds):
+                    outcome, message = judge(records, base[k])
+                    if outcome == "solved":
+                        good[k] = summary(records, settings.clock)
+                    else:
+                        entry |= {"outcome": outcome, "message": message}
+                if not good and entry["outcome"] == "solved":
+                    entry |= {"outcome": "hang", "message": "no result in any round that the base file solved"}
+                if entry["outcome"] == "solved":
+                    pairs = [s["seconds"] / base[k]["seconds"] for k, s in good.items()]
+                    entry |= _median(list(good.values())) | {"spread": [min(pairs), max(pairs)]}
+                    entry["ratios"] = ratios(entry, entry["base"]) | {"time": statistics.median(pairs)}
                 found[n][scene.name] = entry
         return found
 
@@ -560,31 +555,24 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def write(results: Results, folder: Path, page: Path | None = None) -> list[Path]:
-    """Write best.opts, sweep.json, front.png and report.md into the folder of a sweep.
+    """Write best.opts, sweep.json, front.png and report.md into the folder of a sweep; the files written.
 
     Args:
         results: of `Sweep.run`.
         folder: of the sweep.
         page: where the report goes as well, with its picture beside it.
-
-    Returns:
-        The files written.
     """
-    written, lint = [folder / "sweep.json"], ""
+    written = [folder / "sweep.json"]
     write_text(written[0], json.dumps(results, indent=2) + "\n")
     if results["final"] is not None:
-        best = folder / "best.opts"
-        with complete(best) as temporary:
-            shutil.copyfile(folder / "trials" / f"{results['final']['best']:04}.opts", temporary)
-        command = [sys.executable, "-m", "petsc_fs", "lint", str(best)]
-        done = subprocess.run(command, capture_output=True, text=True, env=measure.environment(), check=False)
-        lint = done.stderr.strip() if done.returncode else "no complaint"
-        written.append(best)
+        trial = folder / "trials" / f"{results['final']['best']:04}.opts"
+        write_text(folder / "best.opts", trial.read_text(encoding="utf-8"))
+        written.append(folder / "best.opts")
     for target in filter(None, (folder / "report.md", page)):
         picture = target.with_suffix(".png") if target is page else target.with_name("front.png")
         if results["front"]:
             written.append(_draw(results, picture))
-        write_text(target, "\n".join(report(results, picture.name if results["front"] else None, lint)) + "\n")
+        write_text(target, "\n".join(report(results, picture.name)) + "\n")
         written.append(target)
     return written
 
@@ -593,43 +581,33 @@ def _draw(results: Results, target: Path) -> Path:
     from petsc_fs.tools.plots import plot_front
 
     x, y = results["front_objectives"][:2]
-    groups: dict[str, list[tuple[float, float]]] = {
-        "solved": [],
-        "Pareto front": [],
-        "best.opts": [],
-        "base file": [(1, 1)],
-    }
-    for t in results["trials"]:
-        if t["outcome"] == "solved" and t["same_as"] is None:
-            point = t["totals"][x], t["totals"][y]
-            groups["Pareto front" if t["number"] in results["front"] else "solved"].append(point)
-            if results["final"] is not None and t["number"] == results["final"]["best"]:
-                groups["best.opts"].append(point)
-    return plot_front(groups, (x, y), f"{len(results['trials'])} trials", target)
+    solved = {t["number"]: t["totals"] for t in results["trials"] if t["outcome"] == "solved" and t["same_as"] is None}
+    best = [] if results["final"] is None else [results["final"]["best"]]
+    groups = {"solved": list(solved), "Pareto front": results["front"], "best.opts": best}
+    points = {name: [(solved[n][x], solved[n][y]) for n in numbers] for name, numbers in groups.items()}
+    return plot_front(points | {"base file": [(1, 1)]}, (x, y), f"{len(results['trials'])} trials", target)
 
 
-def report(results: Results, picture: str | None, lint: str) -> Iterator[str]:
+def report(results: Results, picture: str) -> Iterator[str]:
     """The report's lines, in Markdown."""
-    mean = "worst" if results["aggregate"] == "worst" else "geometric mean"
+    final, trials = results["final"], {t["number"]: t for t in results["trials"]}
     yield from (f"# Sweep: {results['description']}", "", f"Written by `{results['command']}`.", "")
     yield f"- space `{results['space']}`, base file `{results['base']}`"
-    yield (
-        f"- each trial solved {', '.join(results['scenes'])} on {results['ranks']} rank(s) to a relative tolerance of "
-        f"{results['tolerance']:g}, {results['repetitions']} time(s)"
-    )
-    yield f"- to make small: {', '.join(results['objectives'])}; the {mean} over scenes of ratios to the base file"
+    yield f"- each trial: {', '.join(results['scenes'])} on {results['ranks']} rank(s) to {results['tolerance']:g}"
+    yield f"- to make small: {', '.join(results['objectives'])}, as ratios to the base file"
     yield f"- time is that of set-up and solve ({measure.CLOCKS[results['clock']]}); memory what processes grew by"
-    yield from ("", *(f"- {name}: {value}" for name, value in results["machine"].items()), "")
-    final = results["final"]
+    yield from (f"- {name}: {value}" for name, value in results["machine"].items())
     if final is not None:
-        yield from (f"## The best file: trial {final['best']}", "")
-        changes = [
-            [f"`-{n}`", *("not set" if v is None else f"`{v}`" for v in both)] for n, both in results["changes"].items()
-        ]
-        yield from markdown(["option", results["base"], "best.opts"], changes)
-        yield from ("", f"`petsc-fs lint best.opts`: {lint}", "")
-        yield f"In turns with the base file, {results['confirm']} times; medians, and the range of ratios:"
-        yield ""
+        yield from ("", f"## The best file: trial {final['best']}", "")
+        pairs = {
+            name: ["not set" if v is None else f"`{v}`" for v in both] for name, both in results["changes"].items()
+        }
+        yield from markdown(["option", results["base"], "best.opts"], [[f"`-{n}`", *both] for n, both in pairs.items()])
+        yield from (
+            "",
+            f"In turns with the base file, {results['confirm']} times; medians, and the range of ratios:",
+            "",
+        )
         named = [(f"trial {n}, {scene}", s) for n, by in final["finalists"].items() for scene, s in by.items()]
         named += [(f"trial {final['best']}, {scene}, held out", s) for scene, s in final["hold_out"].items()]
         yield from markdown(COMPARED, [_compared(name, s) for name, s in named])
@@ -639,31 +617,24 @@ def report(results: Results, picture: str | None, lint: str) -> Iterator[str]:
                 "",
                 f"On {', '.join(worse)} the base file is the better one: best.opts is for scenes like its own.",
             )
-        yield ""
-    yield from (f"## How the {len(results['trials'])} trials ended", "")
+    yield from ("", f"## How the {len(trials)} trials ended", "")
     rows = []
     for kind, count in sorted(results["outcomes"].items(), key=lambda item: -item[1]):
-        message = next((t["message"] for t in results["trials"] if t["outcome"] == kind), "")
+        message = next((t["message"] for t in trials.values() if t["outcome"] == kind), "")
         rows.append([kind, count, OUTCOMES[kind], message[:160]])
     yield from markdown(["outcome", "trials", "meaning", "for example"], rows)
-    if picture is not None:
-        yield from ("", "## Pareto front", "", f"![Trials by time, memory or error]({picture})", "")
-        trials = {t["number"]: t for t in results["trials"]}
+    if results["front"]:
+        yield from ("", "## Pareto front", "", f"![Trials by what was to be made small]({picture})", "")
         values = {n: trials[n]["values"] for n in results["front"]}
         differ = sorted({k for v in values.values() for k in v if len({str(w.get(k)) for w in values.values()}) > 1})
-        rows = [
-            [
-                n,
-                *(f"{trials[n]['totals'][o]:.2f}" for o in OBJECTIVES),
-                ", ".join(f"{k} {_short(v[k])}" for k in differ if k in v),
-            ]
-            for n, v in values.items()
-        ]
+        rows = []
+        for n, v in values.items():
+            words = ", ".join(f"{k} {label(v[k])}" for k in differ if k in v)
+            rows.append([n, *(f"{trials[n]['totals'][o]:.2f}" for o in OBJECTIVES), words])
         yield from markdown(["trial", *OBJECTIVES, "what differs on the front"], rows)
 
 
-COMPARED = ("file, scene", "seconds, base", "seconds", "ratio", "iterations, base", "iterations", "MB, base", "MB",
-    "error, base", "error")  # fmt: skip
+COMPARED = "file, scene;base, s;s;ratio;base, iterations;iterations;base, MB;MB;base, error;error".split(";")
 
 
 def _compared(name: str, s: Summary) -> list[str]:
@@ -676,10 +647,6 @@ def _compared(name: str, s: Summary) -> list[str]:
     cells = [f"{x[key] * factor:{form}}" for key, factor, form in pairs for x in (base, s)]
     ratio = f"**{s['ratios']['time']:.2f}** ({s['spread'][0]:.2f}–{s['spread'][1]:.2f})"
     return [name, *cells[:2], ratio, *cells[2:], *errors]
-
-
-def _short(value: Any) -> str:
-    return f"{value:.3g}" if isinstance(value, float) else str(value).replace(ABSENT, "default")
 
 
 # --- the command line
