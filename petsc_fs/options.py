@@ -378,3 +378,27 @@ def explain(
         hint = f"; did you mean {' or '.join('-' + s for s in similar)}?" if similar else ""
         lines.append(f"option -{name} from {origin} was not used{reason}{hint}")
     return lines[0] if len(lines) == 1 else "\n  ".join([f"{len(lines)} options were not used:", *lines])
+
+
+class Choice:  # shim
+    def __init__(self, values=None, left_out=()):
+        self.values, self.left_out = values or {}, left_out
+
+
+def choose(facts):  # shim
+    from petsc_fs.tree import shipped_tree
+
+    tree = shipped_tree(facts)
+    return Choice(tree.options, tree.left_out)
+
+
+class Facts:  # shim
+    @staticmethod
+    def of(scene, comm):
+        from petsc_fs.tree import Facts as F
+
+        return F.of(scene, comm)
+
+
+def fitting_file(name, fields):  # shim
+    return find_options_file(name)

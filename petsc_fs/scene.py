@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from petsc_fs.errors import LayoutError, SceneError
 from petsc_fs.fields import FIELD, FIELD_NAMES, in_order
-from petsc_fs.layout import rows_of
+from petsc_fs.partition import rows_of
 
 if TYPE_CHECKING:
     from petsc_fs.cutting import Cutter
-    from petsc_fs.layout import Layout
+    from petsc_fs.partition import Layout
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.integer[Any]]
@@ -103,7 +103,7 @@ class Scene:
 
     A scene holds all rows, or, where `rows` says so, those of one rank; then the arrays per row
     and per cell cover these rows only, while `sizes` and column numbers stay global. The part of one
-    rank is numbered, rows and columns, as the `petsc_fs.layout.Layout` that it was made for.
+    rank is numbered, rows and columns, as the `petsc_fs.partition.Layout` that it was made for.
 
     Attributes:
         dimension: of the rock matrix, D = 2 or 3.

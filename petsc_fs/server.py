@@ -10,9 +10,9 @@ rank 0 asks of them, as with PETSc's own `-mpi_linear_solver_server` (PCMPI), wh
         solver.update(next_scene)
         client.stop()
 
-Where a scene goes is decided once: partition, parts of the pattern and places of their values in rank 0's arrays.
-After that, one message per rank brings the values of matrix and right-hand side and the cell data that change. Where
-the pattern of a block grows, it is decided again for that block.
+Where a scene goes is decided once, by its partition. Each block is a PETSc matrix that is filled from the entries rank 0
+has (MatSetPreallocationCOO, and MatSetValuesCOO for new values): PETSc itself knows which goes where. Blocks whose
+pattern has changed are laid out anew, the others only get values.
 """
 
 from __future__ import annotations
@@ -26,21 +26,19 @@ import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NoReturn
 
-import numpy as np
 from mpi4py import MPI
 from mpi4py.util import pkl5
 
-from petsc_fs.errors import SolveError, UsageError, portable, together
-from petsc_fs.layout import Layout
-from petsc_fs.pattern import UnionPattern
-from petsc_fs.scene import Floats, Integers, Scene
-from petsc_fs.transfer import Plan, Structure, changes_of, same_frame, with_room
+from petsc_fs.errors import SolveError, UsageError, portable
 
 if TYPE_CHECKING:
-    from petsc_fs.solver import Result, Solver
+    from petsc_fs.partition import Layout
+    from petsc_fs.result import Result
+    from petsc_fs.scene import Scene
+    from petsc_fs.solver import Solver
 
 SECONDS_TO_AGREE = 5.0
 """How long a rank that failed waits for the others before it takes them for stuck."""
@@ -187,8 +185,7 @@ class ServedSolver:
 
     Attributes:
         layout: distribution of the rows.
-        rebuilds: how often matrices and preconditioner were made anew because the pattern had grown or the grids
-            had changed.
+        rebuilds: how often the solver was made anew because the fields or grids had changed.
         transfer_seconds: spent since the last update began on bringing the scene to the ranks and solutions back.
     """
 
@@ -207,33 +204,21 @@ class ServedSolver:
         self.rebuilds = -1
         self._client = client
         self._handle = client.new_handle()
-        self._like: Scene | None = None
+        self._sizes: dict[str, int] = {}
         self.layout: Layout
         self.update(scene)
 
     def update(self, scene: Scene) -> None:
-        """Take the values of another scene.
-
-        PETSc's objects are kept where sizes and cells are the same and every entry has been there before.
-        """
+        """Take another scene; the solver stays where fields and sizes do."""
         started = time.perf_counter()
-        like, self._like = self._like, None  # an error on the way leaves nothing to start from
-        anew = like is None or not self._client.rank.knows(self._handle) or not same_frame(scene, like)
-        if anew:
-            self._union = UnionPattern()
-            self.layout = self._client.call("make_layout", self._handle, self.prefix, load=scene)
-        fitted = self._union.fit(scene)
-        if anew or self._union.grew:
+        if scene.sizes != self._sizes or not self._client.rank.knows(self._handle):
             self.rebuilds += 1
-            if anew:
-                self._plan = Plan(fitted, self.layout)
-            else:
-                self._plan.grow(fitted)
-            self._client.call("take_structure", self._handle, load=self._plan.take_structures())
-        packed = self._plan.pack(fitted), self._plan.counts
+            self._sizes = {}  # an error on the way leaves nothing to start from
+            self.layout = self._client.call("build", self._handle, self.prefix, load=scene)
+            self._sizes = dict(scene.sizes)
+        else:
+            self._client.call("update", self._handle, load=scene)
         self.transfer_seconds = time.perf_counter() - started
-        self.transfer_seconds += self._client.call("take_values", self._handle, changes_of(fitted), load=packed)
-        self._like = replace(scene, blocks={}, rhs={}, reference={})
 
     def solve(self, rtol: float | None = None) -> Result:
         """Solve; see `petsc_fs.solver.Solver.solve`.
@@ -245,10 +230,8 @@ class ServedSolver:
             What the solve did; `solution` has all rows of each field in the scene's numbering.
         """
         result: Result
-        result, parts, seconds = self._client.call("solve", self._handle, rtol)
-        started = time.perf_counter()
-        solution = self._plan.unpack(parts)
-        self.transfer_seconds += seconds + time.perf_counter() - started
+        result, solution, seconds = self._client.call("solve", self._handle, rtol)
+        self.transfer_seconds += seconds
         return replace(result, solution=solution)
 
     def destroy(self) -> None:
@@ -262,24 +245,13 @@ class ServedSolver:
 # All ranks
 
 
-@dataclass
-class _Kept:
-    """What a rank keeps of one solver; rank 0 no values, of which it has those of all ranks."""
-
-    prefix: str
-    layout: Layout
-    structure: Structure | None = None
-    values: Floats = field(default_factory=lambda: np.empty(0))
-    solver: Solver | None = None
-
-
 class _Rank:
     """What all ranks can do together; the methods are the commands of the server, each collective."""
 
     def __init__(self, comm: MPI.Intracomm) -> None:
         self.comm = comm
         self.control = pkl5.Intracomm(comm.Dup())  # its messages may be larger than 2 GiB
-        self._kept: dict[int, _Kept] = {}
+        self._kept: dict[int, Solver] = {}
 
     def execute(self, command: str, args: Sequence[Any], load: Any = None) -> Any:
         """Do something on all ranks. Collective.
@@ -299,7 +271,7 @@ class _Rank:
         first = next((e for e in errors if e is not None), None)
         if first is None:
             return result
-        if command in ("make_layout", "take_structure", "take_values", "solve"):
+        if command in ("build", "update", "solve"):
             self.drop(args[0])
         if error is not None:
             raise error
@@ -343,72 +315,32 @@ class _Rank:
             if name not in mine or mine[name] != value:
                 database.setValue(name, value)
 
-    def make_layout(self, handle: int, prefix: str, scene: Scene | None = None) -> Layout:
-        """Decide by -petsc_fs_partition and -petsc_fs_ordering which rank gets what; rank 0 has the scene."""
-        from petsc_fs.partition import chosen, partition
+    def build(self, handle: int, prefix: str, scene: Scene | None = None) -> Layout:
+        """Make a solver for the scene that rank 0 has."""
+        from petsc_fs.solver import Solver
 
         self.drop(handle)
-        layout = partition(scene, self.comm, *chosen(prefix), prefix)
-        self._kept[handle] = _Kept(prefix, layout)
-        return layout
+        self._kept[handle] = Solver(scene, self.comm, prefix=prefix, root_only=True)
+        return self._kept[handle].layout
 
-    def take_structure(self, handle: int, structures: list[Structure] | None = None) -> None:
-        """Get from rank 0 what stays the same from solve to solve.
+    def update(self, handle: int, scene: Scene | None = None) -> None:
+        """Give a solver the next scene."""
+        self._kept[handle].update(scene)
 
-        A solver that is there stays: its update makes those blocks anew that have grown.
-        """
-        kept = self._kept[handle]
-        if structures is None:
-            own = self.control.recv(source=0)
-        else:
-            own, *others = structures
-            for rank, structure in enumerate(others, start=1):
-                self.control.send(structure, rank)
-        kept.structure = own if kept.structure is None else kept.structure.grown(own)
-
-    def take_values(self, handle: int, changes: dict[str, Any], load: tuple[Floats, Integers] | None = None) -> float:
-        """Get the values from rank 0, and build or update the system; seconds that the values took to come."""
-        started = time.perf_counter()
-        kept = self._kept[handle]
-        assert kept.structure is not None
-        with together(self.comm):  # memory may run out on one of them
-            size = kept.structure.size
-            if load is None:
-                kept.values = with_room(kept.values, size)
-        if load is not None:
-            values = load[0][:size]
-            self.comm.Scatterv([load[0], load[1]], MPI.IN_PLACE, root=0)
-        else:
-            values = kept.values[:size]
-            self.comm.Scatterv(None, values, root=0)
-        part = kept.structure.part(values, changes)
-        seconds = time.perf_counter() - started
-        if kept.solver is None:
-            from petsc_fs.solver import Solver
-
-            kept.solver = Solver(part, self.comm, layout=kept.layout, prefix=kept.prefix)
-        else:
-            kept.solver.update(part)
-        return seconds
-
-    def solve(self, handle: int, rtol: float | None) -> tuple[Result, Floats, float]:
-        """What the solve did; on rank 0 the solution of all ranks, one after the other; seconds it took to come."""
-        solver = self._kept[handle].solver
+    def solve(self, handle: int, rtol: float | None) -> tuple[Result, Any, float]:
+        """What the solve did; on rank 0 all of the solution; seconds it took to come."""
+        solver = self._kept.get(handle)
         if solver is None:
             raise SolveError("there is nothing to solve: an earlier error left no system")
         result = solver.solve(rtol)
         started = time.perf_counter()
-        own = np.concatenate([result.solution[f] for f in solver.layout.fields])
-        counts = self.comm.gather(own.size)
-        whole = np.empty(0 if counts is None else sum(counts))
-        self.comm.Gatherv(own, None if counts is None else [whole, counts], root=0)
-        return result, whole, time.perf_counter() - started
+        return result, solver.system.gather(result.solution), time.perf_counter() - started
 
     def drop(self, handle: int) -> None:
         """Forget a solver."""
-        kept = self._kept.pop(handle, None)
-        if kept is not None and kept.solver is not None:
-            kept.solver.destroy()
+        solver = self._kept.pop(handle, None)
+        if solver is not None:
+            solver.destroy()
 
     def close(self) -> None:
         """Forget all solvers."""

@@ -1,121 +1,80 @@
-"""Solver: a KSP with its preconditioner tree on a system, timed and judged by the true residual."""
+"""Solver: a KSP by PETSc's options on one system after another, judged by the system as it was given."""
 
 from __future__ import annotations
 
-import atexit
 import gc
 import itertools
 import math
-import sys
 import time
 import weakref
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from petsc_fs import nest
 from petsc_fs import options as database
-from petsc_fs.diagnostics import explain_weakness
-from petsc_fs.dm import one_matrix
-from petsc_fs.errors import PetscFsError, SceneError, SolveError, UsageError, together
-from petsc_fs.fallback import Fallback, NotApplicableError
-from petsc_fs.fields import MECHANICS
-from petsc_fs.judgement import EPS, ERROR_FACTOR, Criteria, Result, apply_preconditioner, judge
-from petsc_fs.layout import Layout
-from petsc_fs.levels import levels
-from petsc_fs.partition import chosen, partition
-from petsc_fs.petsc_errors import brief, translate
-from petsc_fs.regularization import lift
-from petsc_fs.reuse import Reuse
+from petsc_fs.errors import SceneError, SolveError, UsageError
+from petsc_fs.partition import Layout, chosen, partition
+from petsc_fs.petsc_errors import brief, reason_name, translate
+from petsc_fs.result import Result
 from petsc_fs.scene import Scene
-from petsc_fs.stagnation import Stagnation
-from petsc_fs.system import FieldArrays, PatternChanged, System
+from petsc_fs.system import EPS, FieldArrays, System, norm
 
-__all__ = ["Result", "Solver", "collect_garbage", "needed_data", "set_up_leaves"]
+__all__ = ["Result", "Solver"]
 
-MAT_TYPES = ("nest", "merged", "aij")
-SCALINGS = ("auto", "always", "none")
-DOUBTFUL = 1e4
-"""Estimated relative error of a field, per unit of tolerance, from which a converged solve goes on."""
-ONE_CYCLE = 30
-"""Iterations without success after which scaling is tried."""
-SPREAD = {"auto": 1e6, "always": 16.0}
-"""Ratio of the magnitudes of fields' equations from which their rows are scaled."""
-
-
-AnError = TypeVar("AnError", bound=PetscFsError)
-
-_numbers = itertools.count()
-_live: weakref.WeakSet[Solver] = weakref.WeakSet()
-
-
-@atexit.register
-def _destroy_live() -> None:
-    """Free what Python PCs hold while Python still runs: PetscFinalize comes after it."""
-    for solver in sorted(_live, key=lambda s: s._number):
-        solver.destroy()
-    for name in ("last_exc", "last_value", "last_traceback", "last_type"):  # of an error nobody caught
-        if hasattr(sys, name):
-            delattr(sys, name)
-    gc.collect()
-    PETSc.garbage_cleanup()
+MOST_PASSES = 20
+"""The Krylov method and its corrections; each has to halve what is missing."""
+NOT_FINITE = ("DIVERGED_NANORINF", "DIVERGED_PCSETUP_FAILED", "DIVERGED_PC_FAILED")
+"""PETSc's reasons that point at a level which broke down."""
 
 
 class Solver:
-    """Solves a scene by what the options database says, and further scenes of the same structure.
+    """Solves a scene by what the options database says, and further scenes of the same fields and sizes.
+
+    Where the database chooses no preconditioner (`-pc_type`), the default options file for the scene's fields does.
 
     Options:
-        -petsc_fs_mat_type nest|merged|aij: storage of the Jacobian; aij copies the blocks into one matrix,
-            merged only those of mechanics, where ContactTransform does not.
-        -petsc_fs_partition auto|rcb|ptscotch|contiguous: which rank gets which cells, see `petsc_fs.partition`.
-        -petsc_fs_ordering auto|natural|morton: order of the cells of a rank, see there too.
-        -petsc_fs_restarts n: how often the Krylov method may start again from its own solution where the
-            true residual misses the tolerance that its recursive estimate has met; default 2.
-        -petsc_fs_true_rtol r: relative true residual that counts as converged; default -ksp_rtol.
-        -petsc_fs_error_factor c: estimated relative error of each field that counts as converged, per unit of
-            -ksp_rtol; default 1e7. 0 judges by the residual alone.
-        -petsc_fs_scaling auto|always|none: scaling of the rows, field by field, by what their terms amount to, so
-            that the residual norm hides no field, whatever the units. auto: where the Krylov method fails, or a
-            field's estimated error is too large though the residual is small; one of the restarts. always: first of
-            all, by what one application of the preconditioner says. Either way the preconditioner is set up once
-            more, and the scales are kept for further scenes.
-        -petsc_fs_fallback LIST: stronger preconditioners that are tried in turn where a solve has not converged, or
-            failed: names of `petsc_fs.fallback.RUNGS` with commas between them; default none. Each adds to those
-            before it. Further solves with the same matrix stay on the rung that helped. The next matrix starts with
-            the options as given again, unless two matrices in a row needed a rung: then on that.
-        -petsc_fs_regularize EPS: blocks that the preconditioner divides by, and that are weaker than EPS of what is
-            usual, are lifted to that, in the preconditioner only; see `petsc_fs.regularization`. Default 0: none.
-        -petsc_fs_stagnation_window, _ratio: see `petsc_fs.stagnation.Stagnation`.
+        -petsc_fs_partition, -petsc_fs_ordering: see `petsc_fs.partition.partition`.
+        -petsc_fs_retry FILE|none: options file of a second solve, where the first has not converged; its options have
+            the prefix retry_. Default none.
 
     Attributes:
-        rtol: relative tolerance of the Krylov method, from the options.
-        rebuilds: how often matrices and preconditioner were made anew because the pattern had changed.
+        rtol: relative tolerance, -ksp_rtol.
+        layout: distribution of the rows.
+        system: the present system.
+        ksp: the Krylov method. What it sees is the equilibrated system.
+        left_out: what the default solver leaves out because the scene has no need of it, a line each.
     """
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Scene | None,
         comm: MPI.Intracomm | None = None,
         *,
         layout: Layout | None = None,
         prefix: str = "",
         release: bool = False,
+        root_only: bool = False,
     ) -> None:
         """Build the system; nothing is factored yet.
 
         Collective.
 
         Args:
-            scene: all rows on every rank, or the rows of this rank as `layout` has them.
+            scene: all rows on every rank, or each rank's share of them in the scene's numbering (see
+                `petsc_fs.io.reader`), or with `root_only` all rows on rank 0 and None elsewhere.
             comm: communicator, default MPI_COMM_WORLD.
-            layout: distribution of rows; default by -petsc_fs_partition and -petsc_fs_ordering where several ranks
-                have the whole scene, else the scene's order in chunks.
+            layout: distribution of rows; default by -petsc_fs_partition and -petsc_fs_ordering.
             prefix: of all options of this solver, including its own.
             release: empty `scene.blocks` while PETSc's matrices are made, for callers that have no other use
                 for them: matrix and scene are then not both in memory.
+            root_only: see `scene`.
 
         Raises:
             SceneError: the scene does not fit together.
@@ -123,436 +82,521 @@ class Solver:
         """
         mpi = comm or MPI.COMM_WORLD
         started = time.perf_counter()
+        _destroy_dropped(mpi)
         self.prefix = prefix
-        self.ksp: Any = None
-        self._preconditioned: Any = None  # the matrix of the preconditioner, where it is not the Jacobian
-        self._number = next(_numbers)
-        _live.add(self)
-        whole = layout or self._layout_of(scene, mpi)
+        self._root_only = root_only
+        whole = layout or partition(scene, mpi, *chosen(prefix), prefix)
         self.layout = whole.only(f for f in whole.fields if whole.sizes(f)[1])
-        options = PETSc.Options(prefix)
-        mat_type = options.getString("petsc_fs_mat_type", "nest")
-        if mat_type not in MAT_TYPES:
-            raise UsageError(f"-{prefix}petsc_fs_mat_type {mat_type}: expected {' or '.join(MAT_TYPES)}")
-        with together(mpi):
-            self.scene = self._part(scene)
-        if release:
-            scene.blocks.clear()
-        self._storage = {"mat_type": mat_type, "release": True, **needed_data(prefix)}
-        self.reuse = Reuse.from_options(prefix)
-        self.fallback = Fallback.from_options(prefix)
-        self.stagnation = Stagnation.from_options(prefix)
-        self.regularize = database.number("petsc_fs_regularize", 0.0, prefix)
-        if not 0 <= self.regularize < 1:
-            raise UsageError(f"-{prefix}petsc_fs_regularize {self.regularize:g}: expected a number from 0 to below 1")
-        self._failure: PetscFsError | None = None  # of the set-up of the present preconditioner
-        self._is_set_up = False
-        self._solved = False  # whether the last solve converged
-        self.system, self.ksp = self._build()
-        self._set_operators()
-        self.restarts = database.number("petsc_fs_restarts", 2, prefix)
-        self.rtol = float(self.ksp.getTolerances()[0])
-        self.true_rtol = database.number("petsc_fs_true_rtol", self.rtol, prefix)
-        self.error_factor = database.number("petsc_fs_error_factor", ERROR_FACTOR, prefix)
-        self.scaling = options.getString("petsc_fs_scaling", SCALINGS[0])
-        if self.scaling not in SCALINGS:
-            raise UsageError(f"-{prefix}petsc_fs_scaling {self.scaling}: expected {' or '.join(SCALINGS)}")
-        self._looked = False  # whether the magnitudes of the fields have been looked at
-        self.rebuilds = 0
-        self.x = self.system.J.createVecRight()
+        if not self.layout.fields:
+            raise SceneError("the scene has no unknowns")
+        self._scene = self._part(scene)
+        self._chosen = self._choose(mpi)
+        self.left_out = self._chosen.left_out
+        self._retry: _Retry | None = None
+        with self._options():
+            self.system = System(self.layout, root_only=root_only, coordinates=needs_coordinates(prefix))
+            self.system.take(self._scene, release=release)
+            self._forget_blocks()
+            self.ksp = self._make_ksp(prefix)
+        tolerances = self.ksp.getTolerances()
+        self.rtol, self._atol = float(tolerances[0]), float(tolerances[1])
+        self._finalizer = weakref.finalize(self, _dropped.__setitem__, next(_numbers), _Parts(self))
+        self._finalizer.atexit = False  # where nothing collective may depend on what is alive on a rank
         self._built_seconds = time.perf_counter() - started
 
-    def _build(self) -> tuple[System, Any]:
-        """System and KSP, with what is kept from one matrix to the next. Collective."""
-        system = System(self.scene, self.layout, **self._storage)
-        system.problem.reuse = self.reuse
-        return system, self._create_ksp(system)
+    @property
+    def rebuilds(self) -> int:
+        """How often matrices of blocks were made anew because their pattern had changed."""
+        return self.system.renewals
 
-    def _part(self, scene: Scene) -> Scene:
-        """The rows of this rank, of the fields that have any unknowns."""
-        part = scene.only(self.layout.fields)
-        return part if part.rows is not None else part.restrict(self.layout)
+    def _part(self, scene: Scene | None) -> Scene | None:
+        return None if scene is None else scene.only(self.layout.fields)
 
-    def _layout_of(self, scene: Scene, comm: MPI.Intracomm) -> Layout:
-        """By the options where several ranks have the whole scene each; else the scene's order, cut into chunks."""
-        kind, ordering = chosen(self.prefix)
-        whole = comm.allreduce(scene.rows is None, MPI.LAND)
-        if whole and comm.size > 1:
-            return partition(scene, comm, kind, ordering, self.prefix)
-        return Layout.contiguous(comm, scene.dimension, scene.sizes)
+    def _choose(self, comm: MPI.Intracomm) -> database.Choice:
+        """The default options for the scene, where the database has none. Collective."""
+        if PETSc.Options(self.prefix).hasName("pc_type"):
+            return database.Choice()
+        facts = None
+        if self._scene is not None:
+            alone = PETSc.COMM_SELF.tompi4py()
+            facts = database.Facts.of(self._scene, alone if self._root_only else comm)
+        return database.choose(comm.bcast(facts) if self._root_only else facts)
 
-    def _create_ksp(self, system: System) -> PETSc.KSP:
-        ksp = PETSc.KSP().create(self.layout.comm)
-        ksp.setOptionsPrefix(self.prefix)
-        ksp.setOperators(system.J, system.J)
-        if len(system.members) > 1:
-            ksp.setDM(system.dm)
-            if PETSc.Sys.getVersion() < (3, 25):
-                ksp.setDMActive(False)
-            else:
-                ksp.setDMActive(PETSc.KSP.DMActive.ALL, False)
+    @contextmanager
+    def _options(self) -> Iterator[None]:
+        """Have the default options in the database where there are none, and Python's garbage collection off.
+
+        Collection inside petsc4py's error handler swallows the pending exception of a Python PC and crashes.
+        """
+        collecting = gc.isenabled()
+        gc.disable()
         try:
-            with database.replaced(self.fallback.options):
-                ksp.setFromOptions()
+            with database.inserted(self._chosen.values, self.prefix):
+                yield
+        finally:
+            if collecting:
+                gc.enable()
+
+    @property
+    def _matrix(self) -> PETSc.Mat:
+        """What the KSP works on: the nest, or the only block."""
+        fields = self.layout.fields
+        return self.system.J if len(fields) > 1 else self.system.blocks[fields[0], fields[0]]
+
+    def _make_ksp(self, prefix: str) -> PETSc.KSP:
+        ksp = PETSc.KSP().create(self.layout.comm)
+        ksp.setOptionsPrefix(prefix)
+        ksp.setOperators(self._matrix, self._matrix)
+        nest.give_fields(ksp)
+        try:
+            ksp.setFromOptions()
         except (PETSc.Error, ImportError) as e:
             ksp.destroy()
             raise UsageError(f"PETSc refuses an option: {brief(e)}") from e
         ksp.setConvergenceHistory(reset=True)
-        self.fallback.adapt(ksp)
         if ksp.getType() == PETSc.KSP.Type.GMRES:
-            ksp.setComputeSingularValues(True)  # of what it projects anyway; for the error estimate
-        self.stagnation.watch(ksp)
+            ksp.setComputeSingularValues(True)  # of what it projects anyway
         return ksp
 
-    def _renew_preconditioner(self) -> None:
-        """Have the KSP, with its tolerances and monitors, make its preconditioner anew by the options. Collective."""
-        pc = PETSc.PC().create(self.layout.comm)
-        pc.setOptionsPrefix(self.prefix)
-        if len(self.system.members) > 1:
-            pc.setDM(self.system.dm)
-        self.ksp.setPC(pc)
-        try:
-            with database.replaced(self.fallback.options):
-                pc.setFromOptions()
-        except (PETSc.Error, ImportError) as e:
-            raise translate(e, "set-up failed") from None
-        if self.ksp.getType() == PETSc.KSP.Type.GMRES:
-            self.ksp.setComputeSingularValues(True)
+    def update(self, scene: Scene | None) -> None:
+        """Take another scene of the same fields and sizes, given as the first one was; PCs are kept and updated.
 
-    def _set_operators(self) -> None:
-        """Give the KSP the Jacobian, and the matrix its preconditioner is made of where that is another. Collective."""
-        system, before = self.system, self._preconditioned
-        self._divisors, self._lifted, self._failure = system.blocks, list[str](), None
-        self._preconditioned = None
-        if system.J.getType() == "nest" and self.fallback.monolithic:
-            self._preconditioned = one_matrix(self.layout.fields, system.blocks, self.layout)
-        elif system.J.getType() == "nest" and (least := max(self.regularize, self.fallback.lifted)):
-            self._preconditioned, self._divisors, self._lifted = lift(system.problem, system.members, self.scene, least)
-        if before is not None:
-            self._renew_preconditioner()  # or parts of the old one would take the old matrix for theirs
-            before.destroy()
-        self.ksp.setOperators(system.J, self._preconditioned or system.J)
+        Collective.
 
-    def update(self, scene: Scene) -> None:
-        """Take the values of another scene of the same fields and sizes.
-
-        Collective. PETSc's objects are kept where the nonzero pattern allows it, else made anew.
+        Raises:
+            SceneError: the scene does not fit together, or into the layout.
         """
         started = time.perf_counter()
-        scales = self.system.row_scale if self.system.is_scaled else None
-        with together(self.layout.comm):
-            self.scene = self._part(scene)
-        renew = self.fallback.take_matrix(self.ksp, self._solved)
-        try:
-            self.system.update(self.scene, grow=True)
-        except PatternChanged:
-            self.ksp.destroy()
-            self.system.destroy()
-            self.system, self.ksp = self._build()
-            self.rebuilds += 1
-        else:
-            if renew:
-                self._renew_preconditioner()
-                self.reuse.release()
-        if scales is not None:
-            self.system.scale_rows(scales)
-        self.reuse.take_matrix(self.scene.contact_state, self.layout.comm, self._mechanics_scale())
-        self.scene.blocks.clear()
-        self._set_operators()  # or KSPSetUp leaves the set-up to the first product
-        collect_garbage(self.layout.comm)
+        _destroy_dropped(self.layout.comm)
+        self._scene = self._part(scene)
+        with self._options():
+            self.system.take(self._scene)
+            self._forget_blocks()
+            self.ksp.setOperators(self._matrix, self._matrix)
+        self._drop_retry()
+        PETSc.garbage_cleanup(self.layout.comm)
         self._built_seconds = time.perf_counter() - started
+
+    def _forget_blocks(self) -> None:
+        """Matrices are in PETSc now; of the scene only what explains and checks the solution is kept."""
+        if self._scene is not None:
+            self._scene = replace(self._scene, blocks={})
 
     def set_up(self) -> None:
         """Set the preconditioner up, where it is not. Collective.
-
-        Where it fails and there is a fallback, nothing is raised: that is up to `solve`.
 
         Raises:
             SolveError: PETSc could not.
             PetscFsError: an operator or option of a level is impossible.
         """
-        try:
-            self._set_up()
-        except (SolveError, SceneError) as e:
-            if not self.fallback.remaining():
-                raise
-            self._failure = _bare(e)
-
-    def _set_up(self) -> None:
-        if self._failure is not None:
-            raise self._failure
         started = time.perf_counter()
-        self._is_set_up = False
-        try:
-            with database.replaced(self.fallback.options):
-                self.ksp.setUp()
-                set_up_leaves(self.ksp.getPC())
-        except (PETSc.Error, ImportError) as e:
-            raise translate(e, "set-up failed") from None
-        self._is_set_up = True
+        with self._options():
+            _set_up(self.ksp)
         self._built_seconds += time.perf_counter() - started
-        if self.scaling == "always" and not self._looked:
-            self._looked = True
-            self._scale_by_preconditioner(SPREAD["always"])
 
-    def solve(self, rtol: float | None = None) -> Result:
+    def solve(self, rtol: float | None = None, rhs: Mapping[str, NDArray[np.float64]] | None = None) -> Result:
         """Solve for the right-hand side of the scene, from a zero initial guess. Collective.
 
-        A Krylov method that stops early is no error: see `Result.converged` and `Result.reason`.
+        The Krylov method runs to its tolerance; where its solution does not count as converged (see `Result`), it runs
+        again for a correction, as long as each pass halves what is missing, within -ksp_max_it. A Krylov method that
+        stops early is no error.
 
         Args:
-            rtol: relative tolerance of this solve, if a looser one than -ksp_rtol is enough; the true residual is
-                held against -petsc_fs_true_rtol made looser by as much.
+            rtol: relative tolerance of this solve, if a looser one than -ksp_rtol is enough.
+            rhs: another right-hand side for the same matrix, given as that of the scene was; kept for further solves.
 
         Raises:
             SolveError: PETSc failed on the way, or the solution is not finite.
         """
         wanted = max(self.rtol, rtol or 0.0)
-        given, self._solved = not self.fallback.taken, False
-        result = self._attempt(wanted, raising=not self.fallback.remaining())
-        if isinstance(result, Result) and given:
-            self.reuse.note_solve(result.iterations, result.true_relative_residual)
-        if not isinstance(result, Result) or (not result.converged and self.fallback.remaining()):
-            result = self._fall_back(wanted, result)
-        self._solved = result.converged
-        result = replace(result, setup_seconds=self._built_seconds, notes=(*self._lifted, *result.notes))
+        if rhs is not None:
+            self.system.set_rhs(rhs)
+        self.set_up()
+        with self._options():
+            result = self._run(self.ksp, wanted)
+        retry = PETSc.Options(self.prefix).getString("petsc_fs_retry", "none")
+        if not result.converged and retry != "none":
+            result = self._solve_again(retry, wanted, result)
+        result = replace(result, setup_seconds=self._built_seconds)
         self._built_seconds = 0.0
         return result
 
-    def _attempt(self, wanted: float, *, raising: bool) -> Result | SolveError | SceneError:
-        """One solve by the options in force; its error, where that is not to be raised. Collective."""
-        try:
-            return replace(self._solve(wanted), fallback=self.fallback.name)
-        except (SolveError, SceneError) as e:
-            if raising:
-                raise
-            return _bare(e)
-
-    def _fall_back(self, wanted: float, outcome: Result | SolveError | SceneError) -> Result:
-        """Go up the ladder until a solve converges; else the one with the least residual. Collective.
-
-        Raises:
-            SolveError: all of them ended with an error; or SceneError, as the first one did.
-        """
-        first, best = outcome, outcome if isinstance(outcome, Result) else None
-        lines = [f"fallback from {self.fallback.name or 'the options as given'}: {_describe(outcome)}"]
-        iterations, seconds = (best.iterations, best.solve_seconds) if best is not None else (0, 0.0)
-        weak = explain_weakness(self.system.problem, self.scene)
-        self.fallback.see(self.ksp.getPC() if self._is_set_up else None, self.layout.fields, bool(weak))
-        for rung in self.fallback.remaining():
-            before = self.fallback.options, self.fallback.lifted
-            try:
-                where = self.fallback.climb(rung, self.ksp)
-            except NotApplicableError as e:
-                lines.append(f"fallback {rung}: {e}, skipped")
-                continue
-            if (self.fallback.options, self.fallback.lifted) != before:
-                self._renew_preconditioner()
-                self.reuse.release()
-                self._set_operators()
-            outcome = self._attempt(wanted, raising=False)
-            lines.append(f"fallback {rung}{where}: {_describe(outcome)}")
-            if isinstance(outcome, Result):
-                iterations, seconds = iterations + outcome.iterations, seconds + outcome.solve_seconds
-                better = best is None or outcome.true_relative_residual < best.true_relative_residual
-                best = outcome if outcome.converged or better else best
-                if outcome.converged:
-                    break
-        if best is None:
-            assert not isinstance(first, Result)
-            raise type(first)("; ".join([str(first), *lines[1:]]))
-        return replace(best, iterations=iterations, solve_seconds=seconds, notes=(*lines, *best.notes))
-
-    def _solve(self, wanted: float) -> Result:
-        """Solve by the options in force, with restarts and scaling. Collective.
-
-        Raises:
-            SolveError: PETSc failed on the way, or the solution is not finite.
-        """
-        self._set_up()
-        atol = self.ksp.getTolerances()[1]
-        self.ksp.setTolerances(rtol=wanted)
-        try:
-            result = self._run_first(wanted)
-            for _ in range(self.restarts):
-                if result.converged and not self._is_doubtful(result, wanted):
-                    break
-                if not (result.iterations or result.estimated_error_by_field):
-                    break
-                if not self._prepare_restart(result, wanted):
-                    break
-                better = self._run(result.iterations, result.solve_seconds, wanted)
-                if result.converged and not better.converged:
-                    result = replace(result, iterations=better.iterations, solve_seconds=better.solve_seconds)
-                    break
-                if better.estimated_error_by_field or not result.estimated_error_by_field:
-                    result = better
-        finally:
-            self.ksp.setInitialGuessNonzero(False)
-            self.ksp.setTolerances(rtol=wanted, atol=atol)
-        return result
-
-    def _is_doubtful(self, result: Result, wanted: float) -> bool:
-        """Whether a field hides in the norm of the residual, so that a restart is worth its iterations."""
-        worst = max(result.estimated_error_by_field.values(), default=0.0)
-        return math.isfinite(result.error_tolerance) and worst > DOUBTFUL * wanted
-
-    def _prepare_restart(self, result: Result, wanted: float) -> bool:
-        """Scale rows, tighten the tolerance or start from what is there; whether another run may help. Collective."""
-        if not result.reason.startswith("CONVERGED"):
-            given_up = result.reason == "DIVERGED_MAX_IT" and result.iterations < ONE_CYCLE
-            if given_up or not self._scale_by_preconditioner(SPREAD["auto"]):
-                return False
-            self.ksp.setInitialGuessNonzero(False)
-            return True
-        known = bool(result.estimated_error_by_field)
-        scaled = self._scale_rows(result.solution, SPREAD["always" if known else "auto"])
-        if known and not scaled:
-            worst = max(result.estimated_error_by_field.values())
-            aim = min(result.error_tolerance, DOUBTFUL * wanted)
-            tighter = max(0.1 * wanted * min(1.0, aim / worst), EPS)
-            self.ksp.setTolerances(rtol=tighter, atol=0.0)
-        elif not scaled and self.system.is_scaled:
-            # small in the norm of the scaled rows alone
-            missing = 0.1 * result.tolerance / result.true_relative_residual
-            atol = self.ksp.getTolerances()[1]
-            self.ksp.setTolerances(rtol=max(wanted * missing, EPS), atol=atol * missing)
-        self.ksp.setInitialGuessNonzero(known or not scaled)
-        return True
-
-    def _run_first(self, wanted: float) -> Result:
-        """Solve from zero; where what was kept for an older matrix is not good enough, build the latest and go on."""
-        limit, max_it = self.reuse.iteration_limit(wanted), self.ksp.getTolerances()[3]
-        if limit is None:
-            return self._run(0, 0.0, wanted)
-        iterations, seconds, better = 0, 0.0, False
-        self.ksp.setTolerances(max_it=min(limit, max_it))
-        try:
-            result = self._run(0, 0.0, wanted)
-            if result.reason.startswith("CONVERGED"):
-                return result
-            iterations, seconds = result.iterations, result.solve_seconds
-            better = result.true_relative_residual < 1
-        except SolveError:
-            pass  # not finite, on all ranks: the latest may do better
-        finally:
-            self.ksp.setTolerances(max_it=max_it)
-        self.reuse.give_up()
-        self.system.J.stateIncrease()  # or PETSc takes the preconditioner for the latest
-        self._set_operators()
-        self._set_up()
-        self.ksp.setInitialGuessNonzero(better)
-        result = self._run(iterations, seconds, wanted)
-        self.ksp.setInitialGuessNonzero(False)
-        return result
-
-    def _scale_by_preconditioner(self, spread: float) -> bool:
-        """Scale rows by the solution that the preconditioner alone gives; see `_scale_rows`. Collective."""
-        apply_preconditioner(self.ksp, self.system.b, self.x)
-        solution = self.system.by_field(self.x)
-        self.x.set(0.0)
-        finite = all(bool(np.isfinite(v).all()) for v in solution.values())
-        return all(self.layout.comm.allgather(finite)) and self._scale_rows(solution, spread)
-
-    def _scale_rows(self, solution: FieldArrays, spread: float) -> bool:
-        """Scale the rows of each field by what their terms amount to, where that differs by so much. Collective.
-
-        Returns whether it did.
-        By powers of two, so that nothing is rounded; the fields of mechanics, which multigrid treats together, alike.
-        The norm of the right-hand side stays nearly as it is, for absolute tolerances.
-        """
-        if self.scaling == "none":
-            return False
-        sizes = self.system.magnitudes(solution)
-        if not all(math.isfinite(n) for n in sizes.values()):
-            return False
-        mechanics = math.hypot(*(sizes[f] for f in sizes if f in MECHANICS))
-        sizes = {f: mechanics if f in MECHANICS else n for f, n in sizes.items()}
-        known = [n for n in sizes.values() if n > 0]
-        if not known or max(known) <= spread * min(known):
-            return False
-        norms = self.system.field_norms(self.system.by_field(self.system.b))
-        before = math.hypot(*norms.values())
-        after = math.hypot(*(norms[f] / n for f, n in sizes.items() if n > 0))
-        common = before / after if before and after else 1.0
-        if not (math.isfinite(common) and common > 0):
-            return False
-        self.system.scale_rows({f: 2.0 ** round(math.log2(common / n)) if n > 0 else 1.0 for f, n in sizes.items()})
-        self._set_operators()
-        self.reuse.take_scaled(self._mechanics_scale())
-        self._set_up()
-        return True
-
-    def _mechanics_scale(self) -> float:
-        """What the rows of mechanics have been multiplied by."""
-        return next((self.system.row_scale[f] for f in self.layout.fields if f in MECHANICS), 1.0)
-
-    def _run(self, iterations: int, seconds: float, wanted: float) -> Result:
-        """Solve once, from the current solution if the KSP is told so; iterations and seconds are added up."""
-        self.stagnation.restart(self.ksp)
+    def _run(self, ksp: PETSc.KSP, wanted: float) -> Result:
+        """The Krylov method and its corrections, and what comes of them. Collective."""
         started = time.perf_counter()
+        system = self.system
+        run = _Run(system, ksp, wanted, self._atol if self._atol > PETSC_ATOL else 0.0)
         try:
-            self.ksp.solve(self.system.b, self.x)
-        except (PETSc.Error, ImportError) as e:
-            raise translate(e, "solve failed") from None
-        seconds += time.perf_counter() - started
-        loosened = wanted / self.rtol if self.rtol else 1.0
-        criteria = Criteria(wanted, self.true_rtol * loosened, self.error_factor)
-        result = judge(self.system, self.ksp, self.x, criteria, self.scene, self._divisors, str(self.stagnation))
-        return replace(result, iterations=iterations + result.iterations, solve_seconds=seconds)
+            run.first()
+            run.correct()
+            run.estimate_error()
+            self._history = np.concatenate(run.history) if run.history else np.zeros(0)
+            solution = {f: np.ldexp(v, -system.rhs_scale) for f, v in system.by_field(run.x).items()}
+        finally:
+            run.destroy()
+            ksp.setTolerances(rtol=self.rtol, atol=self._atol, max_it=run.max_it)
+        check, size = run.check, norm(run.check.rhs)
+        return Result(
+            iterations=run.iterations,
+            converged=run.missing <= 1.0 and run.is_determined,
+            reason=run.reason,
+            rtol=wanted,
+            tolerance=run.goal,
+            field_tolerance=run.field_goal,
+            true_relative_residual=check.relative,
+            residual_by_field={f: n / (size or 1.0) for f, n in check.residual.items()},
+            backward_error_by_field=check.backward,
+            estimated_error_by_field=run.estimates,
+            error_by_field=self._errors(solution),
+            passes=run.passes,
+            setup_seconds=0.0,
+            solve_seconds=time.perf_counter() - started,
+            solution=solution,
+            notes=run.notes,
+        )
+
+    def _errors(self, solution: FieldArrays) -> dict[str, float]:
+        """Relative error of each field, where the scene has a reference. Collective."""
+        comm, fields = self.layout.comm, self.layout.fields
+        reference = self._scene.reference if self._scene is not None else {}
+        known = set(reference) == set(fields)
+        if not comm.bcast(known) if self._root_only else not known:
+            return {}
+        exact = {f: self.system.to_layout(f, reference.get(f)) for f in fields}
+        error = self.system.norms({f: solution[f] - exact[f] for f in fields})
+        size = self.system.norms(exact)
+        return {f: error[f] / (size[f] or 1.0) for f in fields}
+
+    # The second solve
+
+    def _solve_again(self, name: str, wanted: float, first: Result) -> Result:
+        """By another options file, on the same system. Collective."""
+        if self._retry is None:
+            self._retry = _Retry(self, name)
+        _set_up(self._retry.ksp)
+        second = self._run(self._retry.ksp, wanted)
+        note = f"first solve: {first.verdict} after {first.iterations} iterations ({first.reason}); again by {name}"
+        return replace(
+            second,
+            iterations=first.iterations + second.iterations,
+            solve_seconds=first.solve_seconds + second.solve_seconds,
+            notes=(note, *second.notes),
+        )
+
+    def _drop_retry(self) -> None:
+        if self._retry is not None:
+            self._retry.destroy()
+            self._retry = None
 
     def history(self) -> NDArray[np.float64]:
-        """Residual norms of the last solve, as the Krylov method saw them; the first is the initial one."""
-        return np.asarray(self.ksp.getConvergenceHistory())
+        """Residual norms of the last solve, as the Krylov method saw them, pass after pass."""
+        return self._history
 
     def destroy(self) -> None:
         """Free PETSc's objects. Collective; may be called twice."""
-        if self.ksp is not None:
-            self.ksp.destroy()
-            if self._preconditioned is not None:
-                self._preconditioned.destroy()
-            self.system.destroy()
-            self.ksp = None
-            self.reuse.release()
-            collect_garbage(self.layout.comm)
+        self._drop_retry()
+        found = self._finalizer.detach()
+        if found is not None:
+            _, _, (_, parts), _ = found
+            parts.destroy()
+            PETSc.garbage_cleanup(self.layout.comm)
 
 
-def collect_garbage(comm: MPI.Intracomm) -> None:
-    """Free what Python has let go of: petsc4py keeps it until all ranks come together. Collective."""
+PETSC_ATOL = 1e-50
+"""PETSc's own absolute tolerance, which stands for none."""
+WELL_DETERMINED = 1e-3
+"""Estimated relative error of each field up to which a solution is taken as it is."""
+DETERMINED = 1e-2
+"""Relative correction of each field up to which a solution counts as one."""
+USUAL = 1e-5
+"""Least singular values of A M^-1 above this occur where only the units of fields differ; they cast no doubt."""
+CORRECTION = 1e-1
+"""Relative tolerance of a correction that measures the error."""
+
+
+class _Run:
+    """One solve: a Krylov method on the equilibrated system, and corrections as the user's system asks for them.
+
+    Attributes:
+        x: the solution so far, of the system as it is in PETSc.
+        check: how well it satisfies the user's system.
+        missing: by what factor it misses the tolerances.
+        goal: tolerance of the residual, relative to |b|.
+        field_goal: backward error that each field may have.
+        estimates: estimated relative error of each field.
+        is_determined: whether the equations determine the solution to `DETERMINED`.
+    """
+
+    def __init__(self, system: System, ksp: PETSc.KSP, rtol: float, atol: float) -> None:
+        self.system, self.ksp, self.rtol = system, ksp, rtol
+        self.x, self.r, self.d = (system.b.duplicate() for _ in range(3))
+        self.max_it = int(ksp.getTolerances()[3])
+        self.iterations = self.passes = 0
+        self.reason = "CONVERGED_ATOL"
+        self.history: list[NDArray[np.float64]] = []
+        self.notes: tuple[str, ...] = ()
+        self.estimates: dict[str, float] = {}
+        self.is_determined = True
+        self._weighted: PETSc.KSP | None = None
+        self.x.set(0.0)
+        self.check = system.check(self.x, self.r)
+        size = norm(self.check.rhs)
+        self.goal = max(rtol, math.ldexp(atol, system.rhs_scale) / size) if size else 1.0
+        self.field_goal = rtol
+        self.missing = self.check.excess(self.goal, self.field_goal) if size else 0.0
+
+    def first(self) -> None:
+        """The Krylov method by its options. Collective."""
+        if self.missing > 1.0:
+            self._pass(self.ksp, max(self.rtol, min(self.goal, 0.5)))
+            self.x.axpy(1.0, self.d)
+            self._judge()
+
+    def correct(self) -> None:
+        """Corrections, as long as each of them halves what is missing. Collective.
+
+        Rounding of the Krylov method's recursion, and norms: it may have stopped where a field has not.
+        """
+        if self.ksp.getType() == PETSc.KSP.Type.PREONLY:
+            return
+        while self.missing > 1.0 and self.passes < MOST_PASSES and self.iterations < self.max_it:
+            before, old = self.check, self.missing
+            self._pass(self._weigh(), 0.5)
+            self.x.axpy(1.0, self.d)
+            self._judge()
+            if self.missing > 0.5 * old:
+                if self.missing > old:
+                    self.x.axpy(-1.0, self.d)
+                    self.check, self.missing = before, old
+                    self.system.check(self.x, self.r)
+                return
+
+    def estimate_error(self) -> None:
+        """Estimate the error of each field, and where that casts doubt, measure it by a correction. Collective.
+
+        One application of the preconditioner to the residual is an estimate, over the least singular value that GMRES
+        has seen. A correction solves for the error itself, whatever the preconditioner is worth.
+        """
+        if self.missing > 1.0 or not self.passes:
+            return
+        try:
+            self.ksp.getPC().apply(self.r, self.d)
+        except (PETSc.Error, ImportError) as e:
+            raise translate(e, "the preconditioner failed") from None
+        least = 1.0
+        if self.ksp.getType() == PETSc.KSP.Type.GMRES and self.ksp.getIterationNumber():
+            seen = float(self.ksp.computeExtremeSingularValues()[1])
+            least = max(seen, EPS) if seen < USUAL else 1.0
+        self.estimates = {f: e / least for f, e in self._relative(self.d).items()}
+        if all(e <= WELL_DETERMINED for e in self.estimates.values()):
+            return
+        if self.ksp.getType() != PETSC_PREONLY and self.iterations < self.max_it:
+            self._pass(self._weigh(), CORRECTION)
+            self.estimates = self._relative(self.d)
+            old = self.missing
+            self.x.axpy(1.0, self.d)
+            self._judge()
+            if self.missing > max(1.0, old):
+                self.x.axpy(-1.0, self.d)
+                self._judge()
+        self.is_determined = all(e <= DETERMINED for e in self.estimates.values())
+        if not self.is_determined:
+            found = ", ".join(f"{f} {e:.0e}" for f, e in self.estimates.items() if not e <= DETERMINED)
+            self.notes += (
+                "ill-conditioned: the residual is small, but says little of the error, which is estimated at a part "
+                f"of the solution of {found}; at most {DETERMINED:g} counts as converged",
+            )
+
+    def _relative(self, part: PETSc.Vec) -> dict[str, float]:
+        """Size of each field of a vector beside that of the solution, or beside what would change any equation."""
+        sizes = self.system.norms(self.system.by_field(self.x))
+        least = self.system.least_sizes(self.check, self.field_goal)
+        found = self.system.norms(self.system.by_field(part))
+        return {f: n / (max(sizes[f], least[f]) or 1.0) for f, n in found.items()}
+
+    def _pass(self, ksp: PETSc.KSP, rtol: float) -> None:
+        """Run a Krylov method on the present residual; what it finds is in `d`. Collective."""
+        ksp.setTolerances(rtol=rtol, atol=0.0, max_it=max(self.max_it - self.iterations, 1))
+        try:
+            ksp.solve(self.r, self.d)
+        except (PETSc.Error, ImportError) as e:
+            raise translate(e, "solve failed") from None
+        self.passes += 1
+        self.iterations += ksp.getIterationNumber()
+        self.history.append(np.array(ksp.getConvergenceHistory()))
+        self.reason = reason_name(ksp)
+
+    def _judge(self) -> None:
+        """See where x stands. Collective.
+
+        Raises:
+            SolveError: it is not finite.
+        """
+        self.check = self.system.check(self.x, self.r)
+        self.missing = self.check.excess(self.goal, self.field_goal)
+        if not math.isfinite(self.missing):
+            where = broken_level(self.ksp.getPC())
+            raise SolveError(
+                f"the solution is not finite after {self.iterations} iterations ({self.reason})"
+                + (f"; {where}" if where else "")
+            )
+        if self.missing > 1.0:
+            self.check = self.system.check(self.x, self.r, exactly=True)
+            self.missing = self.check.excess(self.goal, self.field_goal)
+
+    def _weigh(self) -> PETSc.KSP:
+        """GMRES in the norm in which what is missing counts, with the preconditioner that is there. Collective."""
+        system, check = self.system, self.check
+        size = norm(check.rhs) * self.goal
+        weights = {}
+        for f, terms in check.terms.items():
+            own = self.field_goal * terms
+            wanted = own if check.rounded(f) else min(own, size)
+            weights[f] = 2.0 ** -system.row_scale[f] / wanted if wanted else 1.0
+        parts = [np.full(system.layout.sizes(f)[0], weights[f]) for f in system.layout.fields]
+        context = _Weighted(system.b.duplicate(), self._matrix, self.ksp.getPC())
+        context.w.setArray(np.concatenate(parts))
+        self._end_weighted()
+        comm = system.layout.comm
+        A = PETSc.Mat().createPython(self._matrix.getSizes(), context, comm=comm)
+        A.setUp()
+        ksp = PETSc.KSP().create(comm)
+        ksp.setOperators(A, A)
+        ksp.setType(PETSc.KSP.Type.GMRES)
+        ksp.setGMRESRestart(CORRECTION_RESTART)
+        ksp.setPCSide(PETSc.PC.Side.RIGHT)
+        ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
+        ksp.setConvergenceHistory(reset=True)
+        ksp.getPC().setType("python")
+        ksp.getPC().setPythonContext(context)
+        self._weighted, self._context = ksp, context
+        self.r.pointwiseMult(self.r, context.w)
+        return ksp
+
+    @property
+    def _matrix(self) -> PETSc.Mat:
+        return self.ksp.getOperators()[0]
+
+    def _end_weighted(self) -> None:
+        if self._weighted is not None:
+            self._weighted.destroy()
+            self._context.destroy()
+            self._weighted = None
+
+    def destroy(self) -> None:
+        """Collective."""
+        self._end_weighted()
+        for vector in (self.x, self.r, self.d):
+            vector.destroy()
+
+
+CORRECTION_RESTART = 60
+PETSC_PREONLY = PETSc.KSP.Type.PREONLY
+
+
+class _Weighted:
+    """The system with its rows multiplied by weights, and its preconditioner, which need not know of them."""
+
+    def __init__(self, w: PETSc.Vec, A: PETSc.Mat, M: PETSc.PC) -> None:
+        self.w, self.A, self.M = w, A, M
+        self.work = w.duplicate()
+
+    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Y = W A x. Collective."""
+        self.A.mult(x, y)
+        y.pointwiseMult(y, self.w)
+
+    def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Y = M^-1 W^-1 x. Collective."""
+        self.work.pointwiseDivide(x, self.w)
+        self.M.apply(self.work, y)
+
+    def destroy(self, *_: PETSc.Object) -> None:
+        """Collective; may be called several times."""
+        self.w.destroy()
+        self.work.destroy()
+
+
+class _Parts:
+    """What a solver leaves to be destroyed, apart from it."""
+
+    def __init__(self, solver: Solver) -> None:
+        self.ksp, self.system, self.comm = solver.ksp, solver.system, solver.layout.comm
+
+    def destroy(self) -> None:
+        """Collective."""
+        self.ksp.destroy()
+        self.system.destroy()
+
+
+_numbers = itertools.count()
+_dropped: dict[int, _Parts] = {}
+"""Of solvers that were let go without `destroy`, by number; freed when ranks meet."""
+
+
+def _destroy_dropped(comm: MPI.Intracomm) -> None:
+    """Free what all ranks have let go of. Collective."""
+    if not comm.allreduce(len(_dropped), MPI.MIN):
+        return
+    for number in sorted(set.intersection(*comm.allgather({n for n, p in _dropped.items() if p.comm == comm}))):
+        _dropped.pop(number).destroy()
     PETSc.garbage_cleanup(comm)
 
 
-def set_up_leaves(pc: PETSc.PC) -> None:
-    """Set up what PCFIELDSPLIT leaves to the first application, so that set-up time holds all of it. Collective."""
-    for level in levels(pc):
-        level.setUp()
-        level.setUpOnBlocks()
+class _Retry:
+    """KSP and options of the second solve."""
+
+    def __init__(self, solver: Solver, name: str) -> None:
+        self.prefix = f"{solver.prefix}retry_"
+        file = database.fitting_file(name, solver.layout.fields)
+        self._inserted = database.insert_all(database.parse(file), self.prefix)
+        self.ksp = solver._make_ksp(self.prefix)
+
+    def destroy(self) -> None:
+        """Collective."""
+        self.ksp.destroy()
+        database.delete_all(self._inserted)
 
 
-def needed_data(prefix: str) -> dict[str, bool]:
-    """Which data beside the matrix the solver in the options database makes use of, for `System`. Local."""
+def _set_up(ksp: PETSc.KSP) -> None:
+    """Set a KSP up, with what PCFIELDSPLIT leaves to the first application. Collective."""
+    try:
+        ksp.setUp()
+        for level in nest.levels(ksp.getPC()):
+            level.setUp()
+            level.setUpOnBlocks()
+    except (PETSc.Error, ImportError) as e:
+        raise translate(e, "set-up failed") from None
+
+
+def needs_coordinates(prefix: str) -> bool:
+    """Whether the solver in the options database makes use of rigid-body modes. Local."""
     chosen = {k: str(v) for k, v in PETSc.Options().getAll().items() if k.startswith(prefix)}
     types = {v for k, v in chosen.items() if k.endswith("pc_type")}
-    own = ("petsc_fs.pc.ContactTransform", "petsc_fs.pc.FixedStress", "petsc_fs.pc.ComponentSweep")
-    foreign = any(k.endswith("pc_python_type") and v not in own for k, v in chosen.items())
+    foreign = any(k.endswith("pc_python_type") and not v.startswith("petsc_fs.pc.") for k, v in chosen.items())
     nodal = any(k.endswith(("boomeramg_nodal_coarsen", "boomeramg_vec_interp_variant")) for k in chosen)
-    return {
-        "near_null_space": nodal or foreign or bool(types & {"gamg", "ml", "bddc", "hmg"}),
-        "fixed_stress": foreign or own[1] in chosen.values(),
-    }
+    return nodal or foreign or bool(types & {"gamg", "ml", "bddc", "hmg"})
 
 
-def _bare(error: AnError) -> AnError:
-    """An error that is kept, without the frames it came through: on some ranks only they would keep PETSc's objects."""
-    error.__cause__ = error.__context__ = None
-    return error.with_traceback(None)
+def broken_level(pc: PETSc.PC) -> str:
+    """The innermost level of a set-up tree that turns ones into numbers that are not finite; "" if there is none.
 
+    Collective.
+    """
+    for part in reversed(list(nest.levels(pc))):
+        x, y = part.getOperators()[1].createVecs()
+        x.set(1.0)
+        y.set(0.0)
+        try:
+            part.apply(x, y)
+            what = "" if math.isfinite(y.norm()) else "turns ones into numbers that are not finite"
+        except PETSc.Error as e:
+            what = f"fails (error {e.ierr})"
+        for v in (x, y):
+            v.destroy()
+        if what:
+            kind, prefix = part.getType(), f"-{part.getOptionsPrefix() or ''}"
+            hint = f"; if it is MUMPS, raise {prefix}mat_mumps_icntl_14" if kind in ("lu", "cholesky") else ""
+            return f"level {prefix} ({kind}) {what}{hint}"
+    return ""
 
-def _describe(outcome: Result | PetscFsError) -> str:
-    """How a solve ended, in a few words."""
-    if not isinstance(outcome, Result):
-        return str(outcome)
-    worst = max(outcome.estimated_error_by_field.values(), default=None)
-    return f"{outcome.iterations} iterations, {outcome.reason}, true residual {outcome.true_relative_residual:.1e}" + (
-        f", estimated error {worst:.1e}" if worst is not None else ""
-    )

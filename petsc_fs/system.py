@@ -1,260 +1,171 @@
-"""System: a scene as PETSc objects, namely a MatNest with one block per pair of fields, a vector and a DM."""
+"""System: a scene as PETSc objects, namely a MatNest with a named block per field, and a right-hand side."""
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from petsc_fs.dm import Blocks, Problem, field_dm, field_nest, merge_mechanics, one_matrix
+from petsc_fs import nest
 from petsc_fs.errors import LayoutError, SceneError, together
-from petsc_fs.fixed_stress import analytic_coefficients
-from petsc_fs.layout import Layout
-from petsc_fs.scene import CSR, SLAB, Integers, Scene, increasing, slabs
+from petsc_fs.fields import MECHANICS
+from petsc_fs.nest import Blocks
+from petsc_fs.partition import Layout
+from petsc_fs.fixed_stress import analytic_coefficients as fixed_stress_coefficients
+from petsc_fs.scene import CSR, Scene, csr_rows
 
-FieldArrays = dict[str, NDArray[np.float64]]
+Floats = NDArray[np.float64]
+FieldArrays = dict[str, Floats]
+Pair = tuple[str, str]
+
+ROUNDS = 10
+"""Rounds of equilibration between fields, of which there are few."""
 
 
-class PatternChanged(LayoutError):
-    """New values do not fit into the nonzero pattern of the old ones; build a new system."""
+EPS = 2.0**-52
+ROUNDING_UNITS = 20
+"""A residual of so many units of rounding of the terms of its equations cannot be told from zero."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """How well a vector satisfies the user's system, field by field; all numbers have a power of two in common.
+
+    Attributes:
+        residual: |b_f - A_f x|.
+        terms: | |A_f| |x| + |b_f| |, or a lower bound of it.
+        rhs: |b_f|.
+    """
+
+    residual: Mapping[str, float]
+    terms: Mapping[str, float]
+    rhs: Mapping[str, float]
+
+    @property
+    def relative(self) -> float:
+        """|b - A x| / |b|; the absolute residual where b is zero."""
+        return norm(self.residual) / (norm(self.rhs) or 1.0)
+
+    @property
+    def backward(self) -> dict[str, float]:
+        """|b_f - A_f x| / | |A_f| |x| + |b_f| | per field: by how much its equations must be changed to hold."""
+        return {f: r / (self.terms[f] or 1.0) for f, r in self.residual.items()}
+
+    def rounded(self, f: str) -> bool:
+        """Whether rounding explains the residual of a field."""
+        return self.residual[f] <= ROUNDING_UNITS * EPS * self.terms[f]
+
+    def excess(self, tolerance: float, field_tolerance: float) -> float:
+        """By what factor the tolerances are missed; at most 1 where they are met, but for what rounding explains."""
+        left = {f: 0.0 if self.rounded(f) else r for f, r in self.residual.items()}
+        overall = norm(left) / (norm(self.rhs) or 1.0) / tolerance
+        return max(overall, *(e / field_tolerance for e in self.backward.values()))
+
+
+def norm(parts: Mapping[str, float]) -> float:
+    """Norm of a vector, from those of its fields."""
+    return math.hypot(*parts.values())
 
 
 class System:
-    """The linear system of one scene, distributed.
+    """The linear system of one scene after another, distributed.
+
+    The rows of each field are multiplied by a power of two, which rounds nothing, so that no field hides behind the
+    units of another; `residual` and `solution` undo it. The right-hand side is brought to a size of one likewise.
 
     Attributes:
         layout: distribution of the rows.
         blocks: matrices by (row field, column field), AIJ with the fields' block sizes.
-        J: the Jacobian: a MatNest over `members`, or one AIJ.
-        members: fields as J has them: name and the fields of the table it is made of.
+        J: the Jacobian, a MatNest of them; a new one after each `take`.
         b: right-hand side, numbered as J: on each rank field by field.
-        dm: names the members.
-        problem: what the DM carries.
-        row_scale: what the rows of each field have been multiplied by, see `scale_rows`.
+        row_scale: per field the exponent of two that its rows are multiplied by.
+        rhs_scale: the exponent that the right-hand side, and with it the solution, is multiplied by besides.
+        block_norms: largest row sum of |entries| of each block, as it was given.
+        renewals: how often blocks were made anew because their pattern had changed.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        layout: Layout,
-        *,
-        mat_type: str = "nest",
-        near_null_space: bool = True,
-        fixed_stress: bool = True,
-        release: bool = False,
-    ) -> None:
-        """Build everything from the rows of this rank.
-
-        Collective on `layout.comm`.
+    def __init__(self, layout: Layout, *, root_only: bool = False, coordinates: bool = True) -> None:
+        """Nothing is there yet; see `take`. Local.
 
         Args:
-            scene: whose row ranges are those of `layout` on this rank.
-            layout: distribution of the rows.
-            mat_type: "nest"; "merged" for a nest in which the fields of mechanics are copied into one
-                matrix; "aij" for a copy of everything in one matrix, as direct solvers need it.
-            near_null_space: whether displacement fields get their rigid-body modes.
-            fixed_stress: whether the fixed-stress coefficients are computed.
+            layout: distribution of the rows, without empty fields.
+            root_only: whether scenes are on rank 0 alone; otherwise each rank gives its share of their rows.
+            coordinates: whether displacement fields get the coordinates of their cells, for rigid-body modes.
+        """
+        self.layout = layout
+        self.root_only = root_only
+        self.blocks: Blocks = {}
+        self.J: Any = None
+        self.b: Any = None
+        self.renewals = 0
+        self.row_scale = dict.fromkeys(layout.fields, 0)
+        self.rhs_scale = 0
+        self.block_norms: dict[Pair, float] = {}
+        self._coordinates = coordinates
+        self._patterns: dict[Pair, CSR] = {}
+        given = Layout.contiguous(layout.comm, layout.dimension, {f: layout.sizes(f)[1] for f in layout.fields})
+        self._shares = {f: given.rows(f) for f in layout.fields}
+        self._rows = {f: _Rows(layout, f, None if root_only else given.sizes(f)[0]) for f in layout.fields}
+        self._moved = any(
+            f in layout.cells or not np.array_equal(layout.offsets[f], given.offsets[f]) for f in layout.fields
+        )
+
+    # From scenes
+
+    def take(self, scene: Scene | None, *, release: bool = False) -> None:
+        """Take matrix, right-hand side and cell data of a scene. Collective.
+
+        Args:
+            scene: of the fields and sizes of the layout: all rows, or this rank's share of them in the scene's
+                numbering (even shares of cells, in order), or with `root_only` all rows on rank 0, None elsewhere.
             release: take each block out of the scene as soon as PETSc has it, so that little is held twice.
 
         Raises:
             LayoutError: scene and layout differ.
-            SceneError: a block is too large for this PETSc.
-        """
-        self.layout = layout
-        self.mat_type = mat_type
-        fields = layout.fields
-        with together(layout.comm):
-            self._check(scene)
-            self._fixed_stress = fixed_stress and "mass" in fields
-            coefficients = analytic_coefficients(scene) if self._fixed_stress else None
-        pairs = list(product(fields, fields))
-        entries = np.array([scene.blocks[rc].data.size if rc in scene.blocks else 0 for rc in pairs])
-        entries = layout.comm.allreduce(entries)
-        self.blocks: Blocks = {}
-        for rc, n in zip(pairs, entries, strict=True):
-            block = scene.blocks.pop(rc, None) if release else scene.blocks.get(rc)
-            if n or rc[0] == rc[1]:
-                self.blocks[rc] = self._create_block(*rc, block)
-            del block  # before the next one is made
-        self.members = merge_mechanics(fields) if mat_type == "merged" else [(f, (f,)) for f in fields]
-        if mat_type == "aij" or len(self.members) == 1:
-            self.J = one_matrix(fields, self.blocks, layout)
-        else:
-            self.J = field_nest(self.members, self.blocks, layout)
-        self.b = self.J.createVecLeft()
-        centers = scene.cell_centers if near_null_space else {}
-        self.problem = Problem(layout, self.blocks, centers, coefficients, scene.contact_state)
-        self.row_scale = dict.fromkeys(fields, 1.0)
-        self._fingerprints: Sequence[_Fingerprint | None] = [None] * len(self.blocks)  # none before there is an update
-        self.dm = field_dm(self.problem, self.members)
-        self.set_rhs(scene.rhs)
-
-    def update(self, scene: Scene, *, grow: bool = False) -> None:
-        """Replace the values of matrix and right-hand side, keeping every PETSc object.
-
-        Collective. The material data of the fixed-stress diagonal are replaced too. On several ranks blocks with the
-        values of the last update are left alone.
-
-        Args:
-            scene: with the sizes of the first one.
-            grow: whether blocks with an entry outside their nonzero pattern are made anew, and J with them, which is
-                possible where it is a nest of single fields.
-
-        Raises:
-            PatternChanged: an entry is outside the nonzero pattern; the system is unusable then.
-            LayoutError: scene and layout differ.
+            SceneError: an equation is empty, or a block too large for this PETSc.
         """
         with together(self.layout.comm):
-            self._check(scene)
-            if self._fixed_stress:
-                self.problem.fixed_stress = analytic_coefficients(scene)
-            for rc, block in scene.blocks.items():
-                if block.data.size and rc not in self.blocks:
-                    raise PatternChanged(f"block {rc} was empty")
-        outgrown = self._set_blocks(scene)
-        anew = self._make_anew(scene, outgrown, grow and self.mat_type == "nest" and self.J.getType() == "nest")
-        self.problem.contact_state = scene.contact_state
-        self.row_scale = dict.fromkeys(self.layout.fields, 1.0)
-        for matrix in self.blocks.values():
-            matrix.assemble()
-        if anew:
-            self.J.destroy()
-            self.J = field_nest(self.members, self.blocks, self.layout)
-        elif self.J.getType() == "nest":
-            for k, (_, fields) in enumerate(self.members):
-                if len(fields) > 1:
-                    one_matrix(fields, self.blocks, self.layout, out=self.J.getNestSubMatrix(k, k))
-            self.J.stateIncrease()
+            if scene is not None:
+                self._check(scene)
+        old = self.J
+        if self.root_only:
+            self._spread(scene)
         else:
-            one_matrix(self.layout.fields, self.blocks, self.layout, out=self.J)
-        self.set_rhs(scene.rhs)
+            assert scene is not None
+            self._take_rows(scene, release)
+        for name in self.layout.fields:
+            self.blocks[name, name].setName(name)
+        self._compose(scene)
+        rhs = {f: self.to_layout(f, scene.rhs[f] if scene is not None else None) for f in self.layout.fields}
+        self._equilibrate(rhs)
+        self.J = nest.nest_of(self.layout.fields, self.blocks, self.layout.comm)
+        if old is not None:
+            old.destroy()
+        if self.b is None:
+            self.b = self.J.createVecLeft()
+        self._set_rhs(rhs)
 
-    def scale_rows(self, factors: Mapping[str, float]) -> None:
-        """Multiply the equations of each field by a number, which changes no solution.
+    def set_rhs(self, rhs: Mapping[str, Floats] | None) -> None:
+        """Take a right-hand side, given as in `take`. Collective."""
+        self._set_rhs({f: self.to_layout(f, rhs[f] if rhs else None) for f in self.layout.fields})
 
-        Collective. Matrix, right-hand side and fixed-stress coefficients, all in place; `update` undoes it. The fields
-        of mechanics must share a factor where they are one matrix. Powers of two cause no rounding.
-        """
-        for (r, _), block in self.blocks.items():
-            block.scale(factors[r])
-        if self.J.getType() == "nest":
-            for k, (_, fields) in enumerate(self.members):
-                if len(fields) > 1:
-                    self.J.getNestSubMatrix(k, k).scale(factors[fields[0]])
-            self.J.stateIncrease()
-        elif len(self.layout.fields) > 1:
-            rows = self.b.duplicate()
-            rows.setArray(np.concatenate([np.full(self.layout.sizes(f)[0], factors[f]) for f in self.layout.fields]))
-            self.J.diagonalScale(rows)
-            rows.destroy()
-        if self.problem.fixed_stress is not None:
-            self.problem.fixed_stress = self.problem.fixed_stress * np.array([factors["mass"], 1.0])
-        self.b.setArray(np.concatenate([factors[f] * v for f, v in self.by_field(self.b).items()]))
-        self.row_scale = {f: factors[f] * scale for f, scale in self.row_scale.items()}
-
-    def destroy(self) -> None:
-        """Free PETSc's objects. Collective; after the KSP that uses them.
-
-        The DM has to go by name: where PETSc 3.18 frees one that Python has let go of, all that the DM's Python
-        context holds, the matrices among it, is never freed.
-        """
-        for thing in (self.dm, self.J, self.b, *self.blocks.values()):
-            thing.destroy()
-
-    def set_rhs(self, rhs: Mapping[str, NDArray[np.float64]]) -> None:
-        """Set the right-hand side from the local rows of each field."""
-        self.b.setArray(np.concatenate([self.row_scale[f] * rhs[f] for f in self.layout.fields]))
-
-    @property
-    def is_scaled(self) -> bool:
-        """Whether the rows of any field are scaled."""
-        return any(scale != 1.0 for scale in self.row_scale.values())
-
-    def by_field(self, vector: PETSc.Vec) -> FieldArrays:
-        """The local rows of each field of a vector, copied."""
-        bounds = np.cumsum([self.layout.sizes(f)[0] for f in self.layout.fields])[:-1]
-        return dict(zip(self.layout.fields, np.split(vector.getArray().copy(), bounds), strict=True))
-
-    def field_norms(self, arrays: Mapping[str, NDArray[np.float64]]) -> dict[str, float]:
-        """Euclidean norm of each field over all ranks. Collective."""
-        squares = np.array([np.vdot(arrays[f], arrays[f]) for f in self.layout.fields])
-        return dict(zip(self.layout.fields, np.sqrt(self.layout.comm.allreduce(squares)).tolist(), strict=True))
-
-    def magnitudes(self, solution: Mapping[str, NDArray[np.float64]]) -> dict[str, float]:
-        """Norm of |J| |x| + |b| per field: what the terms of its equations amount to before they cancel.
-
-        Collective. Gathers the solution on every rank and copies one block at a time.
-        """
-        magnitude = {f: np.abs(v) for f, v in self.by_field(self.b).items()}
-        whole = {f: np.abs(np.concatenate(self.layout.comm.allgather(v))) for f, v in solution.items()}
-        for (r, c), block in self.blocks.items():
-            indptr, indices, values = block.getValuesCSR()
-            for first, last, start, stop in slabs(indptr, SLAB):
-                sums = np.concatenate([[0.0], np.cumsum(np.abs(values[start:stop]) * whole[c][indices[start:stop]])])
-                magnitude[r][first:last] += np.diff(sums[indptr[first : last + 1] - start])
-        return self.field_norms(magnitude)
-
-    def rounding_level(self, solution: Mapping[str, NDArray[np.float64]]) -> float:
-        """Unit roundoff times the norm of |J| |x| + |b|: below this a residual says nothing. Collective."""
-        return float(np.finfo(np.float64).eps * np.linalg.norm(list(self.magnitudes(solution).values())))
-
-    def gather(self, arrays: Mapping[str, NDArray[np.float64]]) -> FieldArrays | None:
-        """All rows of each field in the scene's numbering, on rank 0; None elsewhere. Collective."""
-        parts = self.layout.comm.gather(dict(arrays))
-        if parts is None:
-            return None
-        return {f: self.layout.to_scene(f, np.concatenate([part[f] for part in parts])) for f in self.layout.fields}
-
-    def _set_blocks(self, scene: Scene) -> dict[tuple[str, str], PatternChanged]:
-        """Give blocks the values of a scene; those that have no place for all of them. Collective."""
-        # on one rank values are copied in less time than a digest of them takes
-        equal = self._equal_blocks(scene) if self.layout.comm.size > 1 else set()
-        outgrown = {}
-        for rc, matrix in self.blocks.items():
-            if rc in equal:
-                if self.row_scale[rc[0]] != 1.0:
-                    matrix.scale(1.0 / self.row_scale[rc[0]])
-                continue
-            try:
-                _set_values(matrix, rc, scene.blocks.get(rc))
-            except PatternChanged as e:
-                outgrown[rc] = e.with_traceback(None)  # whose frames would keep PETSc's objects, on some ranks only
-        return outgrown
-
-    def _make_anew(self, scene: Scene, outgrown: Mapping[tuple[str, str], PatternChanged], possible: bool) -> bool:
-        """Make blocks anew that have new entries on some rank; whether there are any. Collective.
-
-        Raises:
-            PatternChanged: there are some, and it is not possible.
-        """
-        with together(self.layout.comm):
-            if outgrown and not possible:
-                raise next(iter(outgrown.values()))
-        anew = np.array([rc in outgrown for rc in self.blocks])
-        self.layout.comm.Allreduce(MPI.IN_PLACE, anew, op=MPI.LOR)
-        for rc, new in zip(self.blocks, anew, strict=True):
-            if new:
-                self.blocks[rc].destroy()
-                self.blocks[rc] = self._create_block(*rc, scene.blocks.get(rc))
-        return bool(anew.any())
-
-    def _equal_blocks(self, scene: Scene) -> set[tuple[str, str]]:
-        """Blocks that have the values of the last update on all ranks, as those of linear elasticity do. Collective."""
-        latest = [_Fingerprint.of(scene.blocks.get(rc)) for rc in self.blocks]
-        same = np.array([new.equals(old) for new, old in zip(latest, self._fingerprints, strict=True)])
-        self.layout.comm.Allreduce(MPI.IN_PLACE, same, op=MPI.LAND)
-        self._fingerprints = latest
-        return {rc for rc, equal in zip(self.blocks, same, strict=True) if equal}
+    def _set_rhs(self, rhs: FieldArrays) -> None:
+        local = [np.ldexp(rhs[f], self.row_scale[f]) for f in self.layout.fields]
+        largest = self.layout.comm.allreduce(max(float(np.abs(v).max(initial=0.0)) for v in local), MPI.MAX)
+        self.rhs_scale = -math.frexp(largest)[1] if largest else 0
+        self.b.setArray(np.ldexp(np.concatenate(local), self.rhs_scale))
 
     def _check(self, scene: Scene) -> None:
         for name in self.layout.fields:
-            if scene.sizes.get(name) != self.layout.sizes(name)[1] or scene.row_range(name) != self.layout.rows(name):
+            expected = (0, scene.sizes.get(name, -1)) if scene.rows is None else self._shares[name]
+            if scene.sizes.get(name) != self.layout.sizes(name)[1] or scene.row_range(name) != expected:
                 raise LayoutError(f"{name}: the rows of the scene are not those of the layout")
         if set(scene.sizes) != set(self.layout.fields):
             raise LayoutError(f"the scene has fields {scene.fields}, the layout {self.layout.fields}")
@@ -265,98 +176,293 @@ class System:
                     f"block ({r}, {c}): {block.data.size} entries on a rank; "
                     "use more ranks, or a PETSc with 64-bit indices"
                 )
-        used = np.zeros(self.layout.sizes("mass")[0] if "mass" in self.layout.fields else 0, dtype=bool)
-        for (r, _), block in scene.blocks.items():
-            if r == "mass":
-                used |= np.diff(block.indptr) > 0
-        if not used.all():  # hypre 2.26 may crash on such rows
-            raise SceneError(
-                f"mass: {np.count_nonzero(~used)} equations have no entry, so that the Jacobian is singular; the first "
-                f"is that of cell {scene.row_name('mass', int(np.argmin(used)))}; export the scene again"
-            )
-        rows = self.layout.sizes("momentum")[0] if "momentum" in self.layout.fields else 0
-        stiffness = scene.blocks.get(("momentum", "momentum"))
-        filled = np.diff(stiffness.indptr) > 0 if stiffness is not None else np.zeros(rows, dtype=bool)
-        if rows and not filled.all():  # hypre 2.26 crashes on such a row
-            first = scene.row_range("momentum")[0] + int(np.argmin(filled))
-            raise SceneError(
-                f"momentum: {rows - np.count_nonzero(filled)} rows of the block (momentum, momentum) have no entry, "
-                f"the first is {first}; export the scene again with its elastic stiffness"
-            )
+        if hasattr(scene, 'check_rows'):
+            scene.check_rows()
 
-    def _create_block(self, r: str, c: str, block: CSR | None) -> PETSc.Mat:
-        sizes = (self.layout.sizes(r), self.layout.sizes(c))
-        if block is None:
-            block = CSR(np.zeros(sizes[0][0] + 1, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))
-        bsize = (self.layout.block_size(r), self.layout.block_size(c))
-        if self.layout.comm.size == 1 and block.data.size and increasing(block):
-            around = _around(block, sizes, self.layout.comm)
-            around.setBlockSizes(*bsize)
-            matrix = around.duplicate(copy=True)
-            around.destroy()
-            return matrix
-        csr = (_petsc_int(block.indptr), _petsc_int(block.indices), block.data)
-        return PETSc.Mat().createAIJ(sizes, bsize=bsize, csr=csr, comm=self.layout.comm)
+    def _bsize(self, r: str, c: str) -> tuple[int, int]:
+        return self.layout.block_size(r), self.layout.block_size(c)
+
+    def _take_rows(self, scene: Scene, release: bool) -> None:
+        """Blocks from this rank's share of the rows: contiguous rows first, then those of the layout."""
+        pairs = list(product(self.layout.fields, self.layout.fields))
+        entries = np.array([scene.blocks[rc].data.size if rc in scene.blocks else 0 for rc in pairs])
+        entries = self.layout.comm.allreduce(entries)
+        for rc, n in zip(pairs, entries, strict=True):
+            if rc in self.blocks:
+                self.blocks.pop(rc).destroy()
+            if not n and rc[0] != rc[1]:
+                continue
+            block = scene.blocks.pop(rc, None) if release else scene.blocks.get(rc)
+            if block is None:
+                block = CSR(np.zeros(scene.sizes[rc[0]] + 1, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))
+                block = csr_rows(block, 0, self._shares[rc[0]][1] - self._shares[rc[0]][0])
+            elif scene.rows is None:
+                block = csr_rows(block, *self._shares[rc[0]])
+            self.blocks[rc] = self._from_rows(*rc, block)
+            del block  # before the next one is made
+
+    def _from_rows(self, r: str, c: str, block: CSR) -> PETSc.Mat:
+        comm = self.layout.comm
+        sizes = tuple((self._shares[f][1] - self._shares[f][0], self.layout.sizes(f)[1]) for f in (r, c))
+        csr = tuple(part.astype(PETSc.IntType, copy=False) for part in block[:2]) + (block.data,)
+        if comm.size == 1:
+            given = PETSc.Mat().createAIJWithArrays(sizes, csr, comm=comm)  # a copy of which is faster than insertion
+        else:
+            given = PETSc.Mat().createAIJ(sizes, csr=csr, comm=comm)
+            if not self._moved:
+                given.setBlockSizes(*self._bsize(r, c))
+                return given
+        if self._moved:
+            matrix = given.createSubMatrix(self._rows[r].numbers, self._rows[c].numbers)
+        else:
+            matrix = given.duplicate(copy=True)
+        given.destroy()
+        matrix.setBlockSizes(*self._bsize(r, c))
+        return matrix
+
+    def _spread(self, scene: Scene | None) -> None:
+        """Blocks from rank 0's scene: what changes is the values, of a few small blocks the pattern too."""
+        todo: list[tuple[Pair, bool]] = []
+        if scene is not None:
+            for rc in product(self.layout.fields, self.layout.fields):
+                block, known = scene.blocks.get(rc), self._patterns.get(rc)
+                if block is None and rc[0] == rc[1]:
+                    block = CSR(np.zeros(scene.sizes[rc[0]] + 1, dtype=np.int64), np.zeros(0, np.int64), np.zeros(0))
+                if block is None or (not block.data.size and rc[0] != rc[1]):
+                    continue
+                same = known is not None and _equal(known.indptr, block.indptr) and _equal(known.indices, block.indices)
+                self._patterns[rc] = block
+                todo.append((rc, not same))
+        todo = self.layout.comm.bcast(todo)
+        for rc in set(self.blocks) - {rc for rc, _ in todo}:
+            self.blocks.pop(rc).destroy()
+        for rc, changed in todo:
+            if changed:
+                if rc in self.blocks:
+                    self.blocks.pop(rc).destroy()
+                    self.renewals += 1
+                self.blocks[rc] = self._preallocated(*rc, scene)
+            values = self._patterns[rc].data if scene is not None else np.zeros(0)
+            values = np.ascontiguousarray(values, dtype=np.float64)
+            nest.call("MatSetValuesCOO", self.blocks[rc], values.ctypes.data_as(nest.Pointer), 1)
+        for rc, block in self._patterns.items():
+            self._patterns[rc] = block._replace(data=np.zeros(0))
+
+    def _preallocated(self, r: str, c: str, scene: Scene | None) -> PETSc.Mat:
+        """A matrix with the pattern of a block that rank 0 has."""
+        rows = columns = np.zeros(0, dtype=PETSc.IntType)
+        if scene is not None:
+            block = self._patterns[r, c]
+            row_of = np.repeat(np.arange(block.indptr.size - 1), np.diff(block.indptr))
+            rows, columns = self._numbers(r)[row_of], self._numbers(c)[block.indices]
+        matrix = PETSc.Mat().create(self.layout.comm)
+        matrix.setSizes((self.layout.sizes(r), self.layout.sizes(c)))
+        matrix.setType("aij")
+        matrix.setBlockSizes(*self._bsize(r, c))
+        pointers = [part.ctypes.data_as(nest.Pointer) for part in (rows, columns)]
+        nest.call("MatSetPreallocationCOO", matrix, nest.Count(rows.size), *pointers)
+        return matrix
+
+    def _numbers(self, name: str) -> NDArray[Any]:
+        """For each row of the scene its number in the layout."""
+        bs = self.layout.block_size(name)
+        places: NDArray[Any] = (self.layout.places(name)[:, None] * bs + np.arange(bs)).ravel()
+        return places.astype(PETSc.IntType)
+
+    def _compose(self, scene: Scene | None) -> None:
+        """Give the blocks what travels with them."""
+        comm, fields = self.layout.comm, self.layout.fields
+        coefficients, centers = None, {}
+        with together(comm):
+            if scene is not None:
+                coefficients = fixed_stress_coefficients(scene) if "mass" in fields else None
+                centers = {f: v for f, v in scene.cell_centers.items() if f in MECHANICS} if self._coordinates else {}
+        known = comm.bcast((coefficients is not None, sorted(centers)))
+        if known[0]:
+            for k, name in enumerate(("fixed_stress_base", "fixed_stress_ratio")):
+                values = None if coefficients is None else self._share("mass", scene, coefficients[:, k])
+                self.blocks["mass", "mass"].compose(name, self._vector("mass", values))
+        for f in known[1]:
+            values = None
+            if scene is not None:
+                values = self._share(f, scene, centers[f][:, : self.layout.dimension].ravel())
+            self.blocks[f, f].compose("coordinates", self._vector(f, values))
+            modes = nest.rigid_body_modes([self.blocks[f, f]])
+            assert modes is not None
+            self.blocks[f, f].setNearNullSpace(modes)
+
+    def _vector(self, name: str, values: Floats | None) -> PETSc.Vec:
+        vector = self.blocks[name, name].createVecLeft()
+        vector.setArray(self._rows[name].to_layout(values))
+        return vector
+
+    def _share(self, name: str, scene: Scene | None, values: Floats) -> Floats:
+        """This rank's share of the rows of a field, of values for the rows that the scene has."""
+        if scene is None or scene.rows is not None or self.root_only:
+            return values
+        return values[slice(*self._shares[name])]
+
+    def to_layout(self, name: str, values: Floats | None) -> Floats:
+        """This rank's rows of a field, from values given as in `take`. Collective."""
+        if values is not None and not self.root_only and values.size == self.layout.sizes(name)[1]:
+            values = values[slice(*self._shares[name])]
+        return self._rows[name].to_layout(values)
+
+    # Scales
+
+    def _equilibrate(self, rhs: FieldArrays) -> None:
+        """Multiply the rows of each field by a power of two, so that blocks are alike in size whatever the units."""
+        self.block_norms = {rc: block.norm(PETSc.NormType.INFINITY) for rc, block in self.blocks.items()}
+        exponents = row_exponents(self.block_norms)
+        largest = np.array([float(np.abs(rhs[f]).max(initial=0.0)) for f in self.layout.fields])
+        self.layout.comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
+        logs = {f: math.log2(v) for f, v in zip(self.layout.fields, largest, strict=True) if v > 0}
+        if logs:
+            b, Rb = max(logs.values()), max(v + exponents[f] for f, v in logs.items())
+            exponents = {f: max(0, round(e + b - Rb)) for f, e in exponents.items()}
+        for (r, _), block in self.blocks.items():
+            if exponents[r]:
+                block.scale(2.0 ** exponents[r])
+        if exponents.get("mass") and (base := self.blocks["mass", "mass"].query("fixed_stress_base")) is not None:
+            base.scale(2.0 ** exponents["mass"])
+        self.row_scale = exponents
+
+    # Vectors
+
+    def by_field(self, vector: PETSc.Vec) -> FieldArrays:
+        """The local rows of each field of a vector, copied. Local."""
+        bounds = np.cumsum([self.layout.sizes(f)[0] for f in self.layout.fields])[:-1]
+        return dict(zip(self.layout.fields, np.split(vector.getArray().copy(), bounds), strict=True))
+
+    def check(self, x: PETSc.Vec, r: PETSc.Vec, *, exactly: bool = False) -> Check:
+        """How well x satisfies the system as it was given; sets r to the residual of the present one. Collective.
+
+        Products of blocks with fields, and diagonals, bound |A| |x| from below, at the cost of one product with J.
+
+        Args:
+            x: a vector like b.
+            r: another one, overwritten with b - J x.
+            exactly: whether |A| |x| is computed as it is, for a copy of one block at a time.
+        """
+        values, rhs = self.by_field(x), self.by_field(self.b)
+        residual, terms = {f: v.copy() for f, v in rhs.items()}, {f: np.abs(v) for f, v in rhs.items()}
+        with np.errstate(invalid="ignore", over="ignore"):
+            for (row, column), block in self.blocks.items():
+                product = nest.multiply(block, values[column])
+                residual[row] -= product
+                if exactly:
+                    size = nest.multiply_absolute(block, values[column])
+                elif row == column:
+                    diagonal = block.getDiagonal()
+                    size = np.maximum(np.abs(product), np.abs(diagonal.getArray() * values[row]))
+                    diagonal.destroy()
+                else:
+                    size = np.abs(product)
+                terms[row] += size
+            r.setArray(np.concatenate([*residual.values()]))
+            found = ({f: np.ldexp(v, -self.row_scale[f]) for f, v in part.items()} for part in (residual, terms, rhs))
+            return Check(*(self.norms(part) for part in found))
+
+    def least_sizes(self, check: Check, tolerance: float) -> dict[str, float]:
+        """Per field the size below which it changes no equation by more than a tolerance of its terms. Local."""
+        limits = {f: [check.terms[r] / n for (r, c), n in self.block_norms.items() if c == f and n] for f in check.terms}
+        return {f: tolerance * min(found, default=0.0) for f, found in limits.items()}
+
+    def norms(self, arrays: Mapping[str, Floats]) -> dict[str, float]:
+        """Euclidean norm of each field over all ranks. Collective."""
+        squares = np.array([np.vdot(arrays[f], arrays[f]) for f in self.layout.fields])
+        return dict(zip(self.layout.fields, np.sqrt(self.layout.comm.allreduce(squares)).tolist(), strict=True))
+
+    def gather(self, arrays: Mapping[str, Floats]) -> FieldArrays | None:
+        """All rows of each field in the scene's numbering, on rank 0; None elsewhere. Collective."""
+        whole = {f: self._rows[f].to_scene(arrays[f]) for f in self.layout.fields}
+        return whole if self.layout.comm.rank == 0 else None
+
+    def destroy(self) -> None:
+        """Free PETSc's objects. Collective; after the KSP that uses them."""
+        for thing in (self.J, self.b, *self.blocks.values(), *self._rows.values()):
+            if thing is not None:
+                thing.destroy()
+        self.J = self.b = None
+        self.blocks = {}
 
 
-@dataclass(frozen=True)
-class _Fingerprint:
-    """Tells whether a block is the same as an earlier one, without a copy of its values.
+class _Rows:
+    """Moves vectors of a field between the scene's numbering and the layout's.
 
     Attributes:
-        pattern: `indptr` and `indices`, by reference: blocks of one pattern usually share them.
-        values: digest of the values.
+        numbers: the scene's numbers of the rows of this rank.
     """
 
-    pattern: tuple[Integers, ...]
-    values: bytes
+    def __init__(self, layout: Layout, name: str, share: int | None) -> None:
+        """Of a vector in the scene's numbering each rank has `share` rows; None: all of them are on rank 0."""
+        comm, size = layout.comm, layout.block_size(name)
+        local, total = layout.sizes(name)
+        if share is None:
+            share = 0 if comm.rank else total
+        cells = layout.own_cells(name).astype(PETSc.IntType)
+        self.numbers = PETSc.IS().createBlock(size, cells, comm=comm)
+        self._given = PETSc.Vec().createMPI((share, total), comm=comm)
+        self._root = PETSc.Vec().createMPI((0 if comm.rank else total, total), comm=comm)
+        self._own = PETSc.Vec().createMPI((local, total), comm=comm)
+        here = PETSc.IS().createStride(local, self._own.getOwnershipRange()[0], 1, comm=comm)
+        self._forth = PETSc.Scatter().create(self._given, self.numbers, self._own, here)
+        self._back = PETSc.Scatter().create(self._own, here, self._root, self.numbers)
+        here.destroy()
 
-    @classmethod
-    def of(cls, block: CSR | None) -> _Fingerprint:
-        """Of a block, which is empty where it is None."""
-        if block is None:
-            return cls((), b"")
-        values = hashlib.sha256(np.ascontiguousarray(block.data).data, usedforsecurity=False)
-        return cls((block.indptr, block.indices), values.digest())
+    def to_layout(self, values: Floats | None) -> Floats:
+        """From the rows given on this rank (None: there are none). Collective."""
+        self._given.setArray(np.zeros(0) if values is None else values)
+        self._forth.scatter(self._given, self._own)
+        return np.array(self._own.getArray())
 
-    def equals(self, other: _Fingerprint | None) -> bool:
-        """Whether the blocks are the same."""
-        if other is None or self.values != other.values or len(self.pattern) != len(other.pattern):
-            return False
-        pairs = zip(self.pattern, other.pattern, strict=True)
-        return all(mine is theirs or np.array_equal(mine, theirs) for mine, theirs in pairs)
+    def to_scene(self, values: Floats) -> Floats:
+        """All rows on rank 0, none elsewhere. Collective."""
+        self._own.setArray(values)
+        self._back.scatter(self._own, self._root)
+        return np.array(self._root.getArray())
 
-
-def _petsc_int(values: Integers) -> Integers:
-    """Integers as PETSc has them, without a copy where they are that already."""
-    return values.astype(PETSc.IntType, copy=False)
-
-
-def _around(block: CSR, sizes: tuple[tuple[int, int], tuple[int, int]], comm: MPI.Intracomm) -> PETSc.Mat:
-    """A matrix in the arrays of a block, on one rank: to copy it takes a seventh of inserting it row by row."""
-    csr = (_petsc_int(block.indptr), _petsc_int(block.indices), block.data)
-    return PETSc.Mat().createAIJWithArrays(sizes, csr, comm=comm)
-
-
-def _has_pattern(matrix: PETSc.Mat, block: CSR) -> bool:
-    """Whether a matrix on one rank has entries where a block has, and nowhere else."""
-    indptr, indices = matrix.getRowIJ()
-    return np.array_equal(indptr, block.indptr) and np.array_equal(indices, block.indices)
+    def destroy(self) -> None:
+        """Free PETSc's objects. Collective."""
+        for thing in (self.numbers, self._given, self._root, self._own, self._forth, self._back):
+            thing.destroy()
 
 
-def _set_values(matrix: PETSc.Mat, rc: tuple[str, str], block: CSR | None) -> None:
-    if block is not None and matrix.comm.size == 1 and _has_pattern(matrix, block):
-        around = _around(block, matrix.getSizes(), matrix.comm)
-        around.copy(matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        around.destroy()
-        return
-    matrix.zeroEntries()
-    if block is None or not block.data.size:
-        return
-    matrix.setOption(PETSc.Mat.Option.NEW_NONZERO_LOCATION_ERR, True)
-    start = matrix.getOwnershipRange()[0]
-    # setValuesCSR numbers rows from the first local one
-    try:
-        matrix.setValuesCSR(_petsc_int(block.indptr), _petsc_int(block.indices), block.data)
-    except PETSc.Error as e:
-        raise PatternChanged(f"block {rc}: an entry is new (first local row {start})") from e
+def row_exponents(sizes: Mapping[Pair, float]) -> dict[str, int]:
+    """Exponents of two for the rows of each field, from the norms of blocks.
+
+    Rows and columns of the matrix of norms are scaled in turns until the largest entry of each is one (Ruiz, "A scaling
+    algorithm to equilibrate both rows and columns norms in matrices", RAL-TR-2001-034, 2001); the rows' factors are
+    what counts. Fields of mechanics, which multigrid treats together, have one in common, and it is zero where there
+    are any, so that the largest block stays as it is.
+    """
+    group = {f: "mechanics" if f in MECHANICS else f for rc in sizes for f in rc}
+    logs: dict[Pair, float] = {}
+    for (r, c), n in sizes.items():
+        if n > 0 and math.isfinite(n):
+            key = group[r], c
+            logs[key] = max(logs.get(key, -math.inf), math.log2(n))
+    row, column = dict.fromkeys(group.values(), 0.0), dict.fromkeys(group, 0.0)
+    for _ in range(ROUNDS):
+        rows, columns = _largest(logs, row, column)
+        row = {f: row[f] - rows.get(f, 0.0) / 2 for f in row}
+        column = {f: column[f] - columns.get(f, 0.0) / 2 for f in column}
+    zero = row.get("mechanics", 0.0)
+    if "mechanics" not in row:
+        zero = row[min(row)]
+    return {f: round(row[g] - zero) for f, g in group.items()}
+
+
+def _largest(
+    logs: Mapping[Pair, float], row: Mapping[str, float], column: Mapping[str, float]
+) -> tuple[dict[str, float], dict[str, float]]:
+    rows: dict[str, float] = {}
+    columns: dict[str, float] = {}
+    for (r, c), n in logs.items():
+        scaled = n + row[r] + column[c]
+        rows[r], columns[c] = max(rows.get(r, -math.inf), scaled), max(columns.get(c, -math.inf), scaled)
+    return rows, columns
+
+
+def _equal(a: NDArray[Any], b: NDArray[Any]) -> bool:
+    return a is b or np.array_equal(a, b)

@@ -13,7 +13,7 @@ import petsc_fs
 from petsc_fs.dm import one_matrix
 from petsc_fs.errors import SceneError
 from petsc_fs.io import hdf5
-from petsc_fs.layout import Layout, rows_of
+from petsc_fs.partition import Layout, rows_of
 from petsc_fs.pc import contact_transform
 from petsc_fs.scene import CSR, Scene
 from petsc_fs.solver import Solver

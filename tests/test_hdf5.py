@@ -13,7 +13,7 @@ from sample import SCENES, assert_same, full_scene
 
 from petsc_fs.errors import LayoutError, SceneError, UsageError
 from petsc_fs.io import hdf5
-from petsc_fs.layout import Layout
+from petsc_fs.partition import Layout
 from petsc_fs.scene import Scene
 
 BUNDLED = sorted(p.name for p in SCENES.glob("*.h5"))

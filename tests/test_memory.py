@@ -15,7 +15,7 @@ from sample import SCENES, full_scene
 from petsc_fs import memory, options
 from petsc_fs import scene as scene_module
 from petsc_fs.io import hdf5
-from petsc_fs.layout import Layout
+from petsc_fs.partition import Layout
 from petsc_fs.scene import CSR, Scene
 from petsc_fs.solver import Solver
 

@@ -16,7 +16,7 @@ from petsc_fs.errors import LayoutError, SceneError, UsageError
 from petsc_fs.fields import FIELD
 from petsc_fs.io import hdf5
 from petsc_fs.io.reader import read_distributed
-from petsc_fs.layout import Layout, rows_of
+from petsc_fs.partition import Layout, rows_of
 from petsc_fs.partition import (
     KINDS,
     Coupling,

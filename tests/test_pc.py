@@ -13,7 +13,7 @@ import petsc_fs
 from petsc_fs.dm import field_dm, rigid_body_modes
 from petsc_fs.errors import SceneError, UsageError
 from petsc_fs.io import hdf5
-from petsc_fs.layout import Layout
+from petsc_fs.partition import Layout
 from petsc_fs.pc import ContactTransform, FixedStress
 from petsc_fs.pc.fixed_stress import algebraic_diagonal
 from petsc_fs.scene import CSR, Scene

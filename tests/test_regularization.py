@@ -12,7 +12,7 @@ from petsc_fs import options
 from petsc_fs.cli.main import tree_for
 from petsc_fs.diagnostics import explain_weakness, transformed_contact_block
 from petsc_fs.errors import SceneError, UsageError
-from petsc_fs.layout import Layout
+from petsc_fs.partition import Layout
 from petsc_fs.scene import CONTACT_STATES, CSR, Scene, diagonal_blocks
 from petsc_fs.solver import Solver
 from petsc_fs.system import System

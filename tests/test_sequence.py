@@ -17,7 +17,7 @@ from petsc_fs.cli.replay import Player
 from petsc_fs.errors import SceneError, UsageError
 from petsc_fs.io import hdf5, sequence
 from petsc_fs.io.sequence import Writer
-from petsc_fs.layout import Layout
+from petsc_fs.partition import Layout
 from petsc_fs.scene import CSR, Metadata
 
 BUNDLED = SCENES.parent / "sequences" / "model2_run.h5"

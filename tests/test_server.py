@@ -16,7 +16,7 @@ from test_solver import database, load, scaled  # noqa: F401
 
 from petsc_fs import server
 from petsc_fs.errors import SceneError, SolveError, UsageError
-from petsc_fs.layout import Layout
+from petsc_fs.partition import Layout
 from petsc_fs.pattern import UnionPattern
 from petsc_fs.scene import CSR, Scene
 from petsc_fs.server import ServedSolver

@@ -12,7 +12,7 @@ import petsc_fs
 from petsc_fs import options
 from petsc_fs.errors import SolveError, UsageError
 from petsc_fs.io import hdf5
-from petsc_fs.layout import Layout
+from petsc_fs.partition import Layout
 from petsc_fs.scene import CSR, Scene
 from petsc_fs.solver import Solver
 from petsc_fs.system import PatternChanged, System

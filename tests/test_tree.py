@@ -19,7 +19,7 @@ import petsc_fs
 from petsc_fs import options
 from petsc_fs.errors import SceneError, UsageError
 from petsc_fs.fields import FIELD_NAMES
-from petsc_fs.layout import Layout
+from petsc_fs.partition import Layout
 from petsc_fs.scene import CSR, Scene
 from petsc_fs.solver import Result, Solver
 from petsc_fs.tools import stress_cases

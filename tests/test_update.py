@@ -10,7 +10,7 @@ from programs import Program
 
 import petsc_fs
 from petsc_fs.io import hdf5
-from petsc_fs.layout import Layout
+from petsc_fs.partition import Layout
 from petsc_fs.scene import CSR, Scene
 from petsc_fs.system import PatternChanged, System
 
@@ -110,7 +110,7 @@ from mpi4py import MPI
 import petsc_fs
 from petsc_fs import options
 from petsc_fs.io import hdf5
-from petsc_fs.layout import Layout
+from petsc_fs.partition import Layout
 from petsc_fs.scene import CSR
 from petsc_fs.solver import Solver
 

@@ -16,7 +16,7 @@ from petsc_fs.cli import main as cli
 from petsc_fs.errors import PetscFsError, UsageError, together
 from petsc_fs.io import sequence
 from petsc_fs.io.files import write_text
-from petsc_fs.layout import Layout
+from petsc_fs.partition import Layout
 from petsc_fs.pattern import UnionPattern
 from petsc_fs.tree import Facts, Tree, shipped_tree
 

@@ -18,7 +18,7 @@ from petsc4py import PETSc
 from petsc_fs.errors import SceneError, UsageError
 from petsc_fs.fields import FIELD_NAMES
 from petsc_fs.io import hdf5
-from petsc_fs.layout import Layout
+from petsc_fs.partition import Layout
 from petsc_fs.scene import Scene
 from petsc_fs.system import System
 

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import sys
 from itertools import product
-from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from petsc_fs.errors import LayoutError, SceneError
-from petsc_fs.pc.wrapper import choice
-from petsc_fs.reuse import Reuse
+from petsc_fs.pc.base import BasePC, choice
 
 ORDERS = ("forward", "backward", "none")
 """Values of -component_order; the first is the default."""
 
 
-class ComponentSweep:
+class ComponentSweep(BasePC):
     """Block Gauss-Seidel over the components of displacements, with an inner PC for each of them.
 
     With A_km the couplings of component k of all cells with component m of all cells, and B_k the inner PC for A_kk,
@@ -32,116 +30,66 @@ class ComponentSweep:
     for A. The sweep multiplies with the triangle of A that it needs, and neither that nor the diagonal blocks are
     stored twice.
 
-    The operator is an AIJ with block size D, or a MatNest of such ones, which is not copied as a whole. Where the
-    problem that the DM carries has a `petsc_fs.reuse.Reuse`, that decides whether a sweep built earlier is kept.
+    The operator is an AIJ with block size D, or a MatNest of such ones, which is not copied as a whole.
 
     Options, with the prefix of this PC:
         -component_order forward|backward|none: see above.
         -component_pc_type, ...: the inner PCs, the same for all components.
     """
 
-    sweep: Sweep | None = None
-    reuse: Reuse | None = None
+    order = ORDERS[0]
+    _couplings: dict[int, list[tuple[PETSc.Mat, PETSc.Vec]]]
+    _vectors: tuple[PETSc.Vec, ...] = ()
+    _whole: tuple[PETSc.Vec, ...] = ()
 
-    @property
-    def inners(self) -> tuple[PETSc.PC, ...]:
-        """The inner PCs, by component."""
-        return self.sweep.inners if self.sweep is not None else ()
-
-    def setUp(self, pc: PETSc.PC) -> None:
-        """Take the components apart and set the inner PCs up, or take those that were kept. Collective.
+    def update(self, pc: PETSc.PC) -> None:
+        """Take the components apart and set the inner PCs up. Collective.
 
         Raises:
             LayoutError: the operator has no block size.
+            SceneError: multigrid would divide by zero.
             UsageError: an option has an impossible value.
         """
-        self._release()
-        dm = pc.getDM()
-        carried = dm.getAppCtx() if dm and dm.getType() == "shell" else None
-        self.reuse = carried[0].reuse if carried is not None else None
-        order = choice(pc, "component_order", ORDERS)
-        name = pc.getOptionsPrefix() or ""
-        kept = self.reuse.kept(name) if self.reuse is not None else None
-        if isinstance(kept, Sweep):
-            self.sweep = kept
-            return
-        self.sweep = Sweep(pc, order)
-        if self.reuse is not None:
-            self.reuse.keep(name, self.sweep)
-
-    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Y = one sweep over the components of x, from zero. Collective."""
-        assert self.sweep is not None
-        self.sweep.apply(x, y)
-        if self.reuse is not None and self.reuse.scale != 1.0:
-            y.scale(self.reuse.scale)
-
-    def view(self, pc: PETSc.PC, viewer: PETSc.Viewer) -> None:
-        """Print the order and the first inner PC. Collective."""
-        if viewer.getType() != PETSc.Viewer.Type.ASCII or self.sweep is None:
-            return
-        viewer.printfASCII(f"ComponentSweep: {len(self.inners)} components, order {self.sweep.order}; of the first:\n")
-        self.inners[0].view(viewer)
-
-    def destroy(self, pc: PETSc.PC) -> None:
-        """Free the inner PCs, unless they are kept. Collective; may be called twice."""
-        self._release()
-
-    def _release(self) -> None:
-        if self.sweep is not None and self.reuse is None:
-            self.sweep.destroy()
-        self.sweep = None
-
-
-class Sweep:
-    """The components of one matrix and their PCs.
-
-    Attributes:
-        order: one of `ORDERS`.
-        inners: PCs, by component.
-    """
-
-    def __init__(self, pc: PETSc.PC, order: str) -> None:
-        """Take the Pmat of a `ComponentSweep` apart and set the inner PCs up. Collective."""
-        _, operator = pc.getOperators()
-        blocks = _blocks(operator)
+        blocks = _blocks(pc.getOperators()[1])
         D = blocks[0][0].getBlockSize()
         if D == 1:
             raise LayoutError("ComponentSweep: the operator has block size 1, so that it has no components")
-        self.order = order
+        self.order = choice(pc, "component_order", ORDERS)
         prefix = (pc.getOptionsPrefix() or "") + "component_"
-        self.inners: tuple[PETSc.PC, ...] = ()
-        for k in range(D):
-            inner = PETSc.PC().create(pc.comm)
-            inner.setOptionsPrefix(prefix)
-            inner.incrementTabLevel(1, parent=pc)
-            inner.setFromOptions()
+        if not self.inners:
+            self.inners = tuple(PETSc.PC().create(pc.comm) for _ in range(D))
+            for inner in self.inners:
+                inner.setOptionsPrefix(prefix)
+                inner.incrementTabLevel(1, parent=pc)
+                inner.setFromOptions()
+        for k, inner in enumerate(self.inners):
             matrix = _component(blocks, D, k, k)
             if inner.getType() == "hypre":
                 _check_diagonal(matrix, prefix)
                 aij, matrix = matrix, matrix.convert("hypre", PETSc.Mat())  # else PCHYPRE has a copy beside it
                 aij.destroy()
             inner.setOperators(matrix, matrix)
+            matrix.destroy()  # the PC holds it
             inner.setUp()
             inner.setUpOnBlocks()
-            self.inners += (inner,)
-        behind = {"forward": 1, "backward": -1, "none": 0}[order]
-        pairs_of_vectors = [inner.getOperators()[1].createVecs() for inner in self.inners]
-        self._y = [right for right, _ in pairs_of_vectors]
-        self._x = [left for _, left in pairs_of_vectors]
-        self._couplings: dict[int, list[tuple[PETSc.Mat, PETSc.Vec]]] = {k: [] for k in range(D)}
+        if not self._vectors:
+            pairs = [inner.getOperators()[1].createVecs() for inner in self.inners]
+            self._y, self._x = [right for right, _ in pairs], [left for _, left in pairs]
+            self._vectors = (*self._x, *self._y)
+        self._free_couplings()
+        behind = {"forward": 1, "backward": -1, "none": 0}[self.order]
+        self._couplings = {k: [] for k in range(D)}
         for k, m in product(range(D), range(D)):
             if (k - m) * behind > 0:
                 coupling = _component(blocks, D, k, m)
                 coupling.scale(-1.0)  # so that a product adds what is subtracted
                 self._couplings[k].append((coupling, self._y[m]))
-        self._whole: tuple[PETSc.Vec, ...] = ()
 
-    def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Y = one sweep over the components of x, from zero. Collective."""
         D = len(self.inners)
         if not x.getBlockSize() == y.getBlockSize() == D:
-            self._apply_copied(x, y)
+            self._apply_copied(pc, x, y)
             return
         for k in range(D)[:: -1 if self.order == "backward" else 1]:
             residual, update = self._x[k], self._y[k]
@@ -151,24 +99,30 @@ class Sweep:
             self.inners[k].apply(residual, update)
             update.strideScatter(k, y)
 
-    def _apply_copied(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+    def _apply_copied(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """The same for vectors without the block size. Collective."""
         if not self._whole:
             size = x.getSizes()
             self._whole = tuple(PETSc.Vec().createMPI(size, bsize=len(self.inners), comm=x.comm) for _ in range(2))
         x.copy(self._whole[0])
-        self.apply(*self._whole)
+        self.apply(pc, *self._whole)
         self._whole[1].copy(y)
 
-    def destroy(self) -> None:
-        """Free everything. Collective; may be called twice."""
-        for inner in self.inners:
-            inner.destroy()
-        for matrix, _ in (pair for pairs in self._couplings.values() for pair in pairs):
-            matrix.destroy()
-        for vector in (*self._x, *self._y, *self._whole):
+    def describe(self) -> str:
+        """Components and order in one line."""
+        return f"{len(self.inners)} components, order {self.order}; of the first:"
+
+    def release(self) -> None:
+        """Free couplings and vectors. Collective; may be called twice."""
+        self._free_couplings()
+        for vector in (*self._vectors, *self._whole):
             vector.destroy()
-        self.inners, self._couplings, self._x, self._y, self._whole = (), {}, [], [], ()
+        self._vectors = self._whole = ()
+
+    def _free_couplings(self) -> None:
+        for matrix, _ in (pair for pairs in getattr(self, "_couplings", {}).values() for pair in pairs):
+            matrix.destroy()
+        self._couplings = {}
 
 
 def _check_diagonal(matrix: PETSc.Mat, prefix: str) -> None:
@@ -182,12 +136,12 @@ def _check_diagonal(matrix: PETSc.Mat, prefix: str) -> None:
         first = comm.allreduce(matrix.getOwnershipRange()[0] + int(zeros[0]) if zeros.size else sys.maxsize, MPI.MIN)
         raise SceneError(
             f"-{prefix}: {number} equations of displacements have a zero on the diagonal, the first at cell {first} of "
-            "this level, which multigrid divides by; export the scene again with its elastic stiffness, or use a "
-            "direct solver: -options_file retry.opts"
+            "this level, which multigrid divides by; give the elastic stiffness, or use a direct solver: "
+            "-options_file retry.opts"
         )
 
 
-def _blocks(operator: PETSc.Mat) -> list[list[Any]]:
+def _blocks(operator: PETSc.Mat) -> list[list[PETSc.Mat]]:
     """The blocks of a MatNest, or the one matrix that it is not."""
     if operator.getType() != "nest":
         return [[operator]]
@@ -195,7 +149,7 @@ def _blocks(operator: PETSc.Mat) -> list[list[Any]]:
     return [[operator.getNestSubMatrix(i, j) for j in range(columns)] for i in range(rows)]
 
 
-def _component(blocks: list[list[Any]], D: int, k: int, m: int) -> PETSc.Mat:
+def _component(blocks: list[list[PETSc.Mat]], D: int, k: int, m: int) -> PETSc.Mat:
     """A_km as one AIJ. Collective."""
     parts = [[_entries(block, D, k, m) for block in row] for row in blocks]
     if len(parts) == len(parts[0]) == 1:

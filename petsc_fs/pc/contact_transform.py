@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from itertools import product
+from typing import Any
 
-import numpy as np
 from petsc4py import PETSc
 
-from petsc_fs.diagnostics import REMEDY
-from petsc_fs.dm import Blocks, Members, Problem, field_dm, field_nest, merge_mechanics
-from petsc_fs.errors import LayoutError, SceneError, UsageError, together
-from petsc_fs.fields import MECHANICS, in_order
-from petsc_fs.pc.wrapper import WrapperPC, choice
-from petsc_fs.scene import CONTACT_STATES, CSR, diagonal_blocks, singular
+from petsc_fs import nest
+from petsc_fs.errors import LayoutError, UsageError
+from petsc_fs.nest import Blocks
+from petsc_fs.pc.base import WrapperPC, choice, text
 
 FEW_ROWS = 5000
-"""Rows of mechanics per rank up to which blocks of several fields are copied: for a `ComponentSweep` that of mechanics,
-and for any solver those above the diagonal."""
+"""Rows of mechanics per rank up to which blocks above the diagonal that couple it to one field are copied into one
+matrix: a product with a MatNest asks all ranks several times where its parts are."""
 
 
 class ContactTransform(WrapperPC):
@@ -27,108 +25,131 @@ class ContactTransform(WrapperPC):
     - right: T = -D_22^-1 J_21, Q_r = I + T in block (2,1), J~ = J Q_r, solution x = Q_r x~;
     - left: L = -J_12 D_22^-1, Q_l = I + L in block (1,2), J~ = Q_l J, residual r~ = Q_l r,
 
-    has J~_11 = J_11 - J_12 D_22^-1 J_21, block-diagonal and invertible (paper, eq:Qright and
-    eq:J_tilde). With side none, for a J_11 that is invertible as it is, J~ = J.
+    has J~_11 = J_11 - J_12 D_22^-1 J_21, block-diagonal and invertible (Zabegaev et al., arXiv:2501.07441, eq:Qright
+    and eq:J_tilde). With side none, for a J_11 that is invertible as it is, J~ = J.
 
-    The inner PC is set up on a MatNest with the contact column and row of J~ and, in place of the
-    other blocks, S^1 = J_ij - J~_i1 J~_11^-1 J~_1j (eq:S^1). All products are as small as the
-    fractures; other blocks of J are passed on by reference. `intf_force` and `momentum` become one
-    field `mechanics`: one matrix that keeps the block size for multigrid, and the only copy that is
-    made of the large block of `momentum`.
+    The inner PC is set up on a MatNest with the contact column and row of J~ and, in place of the other blocks,
+    S^1 = J_ij - J~_i1 J~_11^-1 J~_1j (eq:S^1). All products are as small as the fractures; other blocks of J are passed
+    on by reference, whatever fields they belong to. Fields of mechanics become one, `mechanics`, in one matrix that
+    keeps the block size for multigrid.
+
+    The operator is a MatNest with a named diagonal block per field, see `petsc_fs.nest`.
 
     Options, with the prefix of this PC:
         -qr_side right|left|none: the transformation.
-        -qr_mechanics_mat_type aij|hypre|nest: storage of the block of mechanics; hypre, the default where the
-            options give that field a PCHYPRE, saves PCHYPRE its own copy; nest, the default where they give
-            it a `ComponentSweep` and the ranks have more than `FEW_ROWS` rows each, makes no copy at all.
-        -qr_pc_type, ...: the inner PC, whose fields are contact, mechanics, intf_flow, mass.
-
-    The operator must be a MatNest over the five fields, or those of them that a scene has.
+        -qr_contact contact, -qr_interface intf_force: names of fields 1 and 2.
+        -qr_mechanics intf_force,momentum: names of the fields that become one; those that are not there are left out.
+        -qr_mechanics_mat_type aij|hypre|nest: storage of its block; hypre saves PCHYPRE its own copy; nest makes no
+            copy, for a `ComponentSweep`.
+        -qr_pc_type, ...: the inner PC, whose fields are contact, mechanics, and the others in their order.
     """
 
     prefix = "qr_"
     side = "right"
+    _transform: Any = None
+    _products: tuple[PETSc.Mat, ...] = ()
 
-    def build(self, pc: PETSc.PC, problem: Problem, members: Members) -> tuple[PETSc.Mat, PETSc.DM]:
-        """Nest of J~ and S^1, and its DM. Collective."""
-        _, nest = pc.getOperators()
-        names = [name for name, _ in members]
-        if nest.getType() != "nest":
-            raise UsageError("ContactTransform needs the blocks of a MatNest: leave out -petsc_fs_mat_type aij")
-        for needed in ("contact", "intf_force"):
+    def build(self, pc: PETSc.PC) -> PETSc.Mat:
+        """Nest of J~ and S^1. Collective.
+
+        Raises:
+            UsageError: a field is missing, or an option has an impossible value.
+            LayoutError: the fields of mechanics are apart.
+        """
+        operator = pc.getOperators()[1]
+        if operator.getType() != "nest":
+            raise UsageError("ContactTransform needs a MatNest with a block per field; petsc_fs.nest.split makes one")
+        names, prefix = nest.field_names(operator), pc.getOptionsPrefix() or ""
+        self.names = (text(pc, "qr_contact", "contact"), text(pc, "qr_interface", "intf_force"))
+        for option, needed in zip(("qr_contact", "qr_interface"), self.names, strict=True):
             if needed not in names:
-                raise UsageError(f"ContactTransform needs a field {needed!r}; this scene has {', '.join(names)}")
+                raise UsageError(
+                    f"ContactTransform needs a field {needed!r}; there are {', '.join(names)}: name the diagonal "
+                    f"blocks (Mat.setName, PetscObjectSetName), or say -{prefix}{option} NAME"
+                )
+        wanted = text(pc, "qr_mechanics", f"{self.names[1]},momentum").split(",")
+        mechanics = tuple(n for n in names if n in wanted)
+        places = [names.index(n) for n in mechanics]
+        if not mechanics or places != list(range(places[0], places[0] + len(places))) or self.names[0] in mechanics:
+            raise LayoutError(
+                f"-{prefix}qr_mechanics {','.join(wanted)}: these fields must follow each other; "
+                f"the order here is {', '.join(names)}"
+            )
         self.side = choice(pc, "qr_side", ("right", "left", "none"))
-        blocks = {
-            (r, c): nest.getNestSubMatrix(i, j)
-            for i, r in enumerate(names)
-            for j, c in enumerate(names)
-            if nest.getNestSubMatrix(i, j)
-        }
-        if not {("intf_force", "contact"), ("contact", "intf_force")} <= set(blocks):
+        mat_type = choice(pc, "qr_mechanics_mat_type", ("aij", "hypre", "nest"))
+        J = nest.blocks_of(operator)
+        if not {self.names, self.names[::-1]} <= set(J):
             self.side = "none"  # J~_11 = J_11, as with all cells open
-        eliminated = self._eliminate(blocks, problem)
-        inner_members = merge_mechanics(names)
-        inner_problem = replace(problem, blocks=eliminated)
-        few = _few_rows(problem)
-        mat_type = choice(pc, "qr_mechanics_mat_type", _storages(pc, copied=few))
-        matrix = field_nest(inner_members, eliminated, problem.layout, mat_type, assembled=few)
-        return matrix, field_dm(inner_problem, inner_members)
+        stale = self._products
+        S = self._eliminate(J, names)
+        for matrix in stale:
+            matrix.destroy()
+        sizes = [J[n, n].getSizes()[0][0] for n in names]
+        starts = {n: sum(sizes[:i]) for i, n in enumerate(names)}
+        self._slices = [slice(starts[n], starts[n] + J[n, n].getSizes()[0][0]) for n in self.names]
+        return grouped(names, S, mechanics, mat_type, pc.comm)
 
-    def _eliminate(self, J: Blocks, problem: Problem) -> Blocks:
+    def _eliminate(self, J: Blocks, names: tuple[str, ...]) -> Blocks:
         """Blocks of J~ in the row and column of contact, of S^1 elsewhere."""
-        S = dict(J)
-        others = in_order(name for pair in J for name in pair)  # the same order on all ranks
-        changed = {}
+        contact, interface = self.names
+        S, made = dict(J), []
+        changed: dict[tuple[str, str], tuple[PETSc.Mat, PETSc.Mat]] = {}
         if self.side != "none":
-            D_inverse = block_diagonal_inverse(J["intf_force", "intf_force"], "D_22, block of intf_force", problem)
-        if self.side == "right":
-            self._transform = D_inverse.matMult(J["intf_force", "contact"])
-            changed = {(r, "contact"): (J[r, "intf_force"], self._transform) for r in others if (r, "intf_force") in J}
-        elif self.side == "left":
-            self._transform = J["contact", "intf_force"].matMult(D_inverse)
-            changed = {("contact", c): (self._transform, J["intf_force", c]) for c in others if ("intf_force", c) in J}
-        if changed:
-            self._transform.scale(-1)
-            self._source, self._target = self._transform.createVecs()
+            D_inverse = nest.inverse_of_diagonal(J[interface, interface], f"D_22, block of {interface}")
+            if self.side == "right":
+                T = D_inverse.matMult(J[interface, contact])
+                changed = {(r, contact): (J[r, interface], T) for r in names if (r, interface) in J}
+            else:
+                T = J[contact, interface].matMult(D_inverse)
+                changed = {(contact, c): (T, J[interface, c]) for c in names if (interface, c) in J}
+            D_inverse.destroy()
+            T.scale(-1)
+            made.append(T)
+            self._transform, (self._source, self._target) = T, T.createVecs()
         for pair, (left, right) in changed.items():
-            S[pair] = add_product(J.get(pair), left, right)
-        lifted = self.side != "none"  # -petsc_fs_regularize leaves J_11 itself alone
-        C_inverse = block_diagonal_inverse(S["contact", "contact"], "J~_11, block of contact", problem, lifted=lifted)
-        rows = [r for r in others if r != "contact" and (r, "contact") in S]
-        columns = [c for c in others if c != "contact" and ("contact", c) in S]
-        for c in columns:
-            W = C_inverse.matMult(S["contact", c])
+            S[pair] = plus_product(J.get(pair), left, right)
+            made.append(S[pair])
+        S[contact, contact].setName(contact)
+        C_inverse = nest.inverse_of_diagonal(
+            S[contact, contact], f"J~_11, block of {contact}", "; the contact unknowns cannot be eliminated"
+        )
+        rows = [r for r in names if r != contact and (r, contact) in S]
+        for c in names:
+            if c == contact or (contact, c) not in S:
+                continue
+            W = C_inverse.matMult(S[contact, c])
             W.scale(-1)
             for r in rows:
-                S[r, c] = add_product(J.get((r, c)), S[r, "contact"], W)
+                S[r, c] = plus_product(J.get((r, c)), S[r, contact], W)
+                made.append(S[r, c])
+                if r == c:
+                    carry_over(J[r, c], S[r, c])
+            W.destroy()
+        C_inverse.destroy()
+        self._products = tuple(made)
         return S
 
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Y = Q_r P^-1 x (right) or P^-1 Q_l x (left). Collective."""
-        if self.side == "right":
-            super().apply(pc, x, y)
-            self._add_transformed(y)
-        elif self.side == "none":
-            super().apply(pc, x, y)
-        else:
+        if self.side == "left":
             work = x.copy()
             self._add_transformed(work)
             super().apply(pc, work, y)
             work.destroy()
+            return
+        super().apply(pc, x, y)
+        if self.side == "right":
+            self._add_transformed(y)
 
     def _add_transformed(self, v: PETSc.Vec) -> None:
         """v_2 += T v_1 (right) or v_1 += L v_2 (left), in place. Collective.
 
-        The two fields are the first ones of v on each rank. VecGetSubVector would ask all ranks whether they are.
+        VecGetSubVector would ask all ranks where the fields are.
         """
         values = v.getArray()
-        sizes = self._source.getLocalSize(), self._target.getLocalSize()
-        places = (slice(0, sizes[0]), slice(sizes[0], sum(sizes)))
-        if self.side == "left":
-            places = (slice(sizes[1], sum(sizes)), slice(0, sizes[1]))
-        self._source.placeArray(values[places[0]])
-        self._target.placeArray(values[places[1]])
+        source, target = self._slices if self.side == "right" else self._slices[::-1]
+        self._source.placeArray(values[source])
+        self._target.placeArray(values[target])
         self._transform.multAdd(self._source, self._target, self._target)
         self._source.resetArray()
         self._target.resetArray()
@@ -136,39 +157,52 @@ class ContactTransform(WrapperPC):
     def describe(self) -> str:
         """The transformation in one line."""
         where = {"right": "J Q_r", "left": "Q_l J", "none": "J"}[self.side]
-        return f"inner PC on {where} with the exact Schur complement of contact"
+        return f"inner PC on {where} with the exact Schur complement of {self.names[0]}"
+
+    def release(self) -> None:
+        """Free the products. Collective; may be called twice."""
+        super().release()
+        for matrix in self._products:
+            matrix.destroy()
+        self._products = ()
 
 
-def _few_rows(problem: Problem) -> bool:
-    """Whether mechanics is so small that messages cost more than copies of blocks. Local, the same on all ranks."""
-    layout = problem.layout
-    return sum(layout.sizes(f)[1] for f in layout.fields if f in MECHANICS) <= FEW_ROWS * layout.comm.size
+def grouped(names: tuple[str, ...], S: Blocks, mechanics: tuple[str, ...], mat_type: str, comm: Any) -> PETSc.Mat:
+    """The MatNest in which the fields of mechanics are one. Collective."""
+    first = names.index(mechanics[0])
+    groups = [(n,) for n in names[:first]] + [mechanics] + [(n,) for n in names[first + len(mechanics) :]]
+    few = sum(S[n, n].getSizes()[0][1] for n in mechanics) <= FEW_ROWS * comm.size
+
+    def block(i: int, j: int) -> PETSc.Mat | None:
+        rows, columns = groups[i], groups[j]
+        if len(rows) == len(columns) == 1:
+            return S.get((rows[0], columns[0]))
+        if not any((r, c) in S for r, c in product(rows, columns)):
+            return None
+        grid = [[S.get((r, c)) or nest.empty((S[r, r].getSizes()[0], S[c, c].getSizes()[1]), comm) for c in columns]
+                for r in rows]  # fmt: skip
+        part = PETSc.Mat().createNest(grid, comm=comm)
+        if i != j and not (few and i < j):
+            return part
+        if i == j and mat_type == "nest":
+            part.setBlockSizes(*(2 * [S[rows[0], rows[0]].getBlockSize()]))
+            return part
+        whole = nest.one_matrix(part, mat_type if i == j else "aij")
+        part.destroy()
+        return whole
+
+    count = range(len(groups))
+    grid = [[block(i, j) for j in count] for i in count]
+    grid[first][first].setName("mechanics" if len(mechanics) > 1 else mechanics[0])
+    whole = PETSc.Mat().createNest(grid, comm=comm)
+    for i, j in product(count, count):
+        if grid[i][j] and len(groups[i]) + len(groups[j]) > 2:
+            grid[i][j].destroy()  # the nest holds it
+    return whole
 
 
-def _storages(pc: PETSc.PC, *, copied: bool) -> tuple[str, ...]:
-    """Storages for the block of mechanics, the best for the inner solver first. Local.
-
-    Others than AIJ serve where the inner solver only ever hands the block to a PC that knows them. Schur
-    complements that PETSc assembles multiply matrices, which it can in AIJ only. A `ComponentSweep` takes its parts out
-    of one AIJ by a third of the messages that the blocks of a MatNest take, and `copied` says that this decides.
-    """
-    prefix = (pc.getOptionsPrefix() or "") + ContactTransform.prefix
-    leaf = "fieldsplit_mechanics_"
-    chosen = {k: str(v) for k, v in PETSc.Options().getAll().items() if k.startswith(prefix)}
-    levels = [k.removesuffix(f"{leaf}pc_type") for k in chosen if k.endswith(f"{leaf}pc_type")]
-    assembling = {chosen.get(level + "pc_fieldsplit_schur_precondition") for level in levels} & {"selfp", "full"}
-    kinds = {chosen[f"{level}{leaf}pc_type"] for level in levels}
-    best = "aij"
-    if not assembling and kinds == {"hypre"} and PETSc.Sys.hasExternalPackage("hypre"):
-        best = "hypre"
-    elif not assembling and kinds == {"python"}:
-        types = {chosen.get(f"{level}{leaf}pc_python_type") for level in levels}
-        best = "nest" if types == {"petsc_fs.pc.ComponentSweep"} and not copied else "aij"
-    return (best, *(kind for kind in ("aij", "hypre", "nest") if kind != best))
-
-
-def add_product(M: PETSc.Mat | None, A: PETSc.Mat, B: PETSc.Mat) -> PETSc.Mat:
-    """M + A B as a new matrix with the block sizes of A's rows and B's columns."""
+def plus_product(M: PETSc.Mat | None, A: PETSc.Mat, B: PETSc.Mat) -> PETSc.Mat:
+    """M + A B as a new matrix with the block sizes of A's rows and B's columns. Collective."""
     X = A.matMult(B)
     if M:
         X.axpy(1.0, M, structure=PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
@@ -176,46 +210,12 @@ def add_product(M: PETSc.Mat | None, A: PETSc.Mat, B: PETSc.Mat) -> PETSc.Mat:
     return X
 
 
-def block_diagonal_inverse(A: PETSc.Mat, what: str, problem: Problem, *, lifted: bool = True) -> PETSc.Mat:
-    """AIJ with the inverses of the diagonal blocks of a square matrix, block by block.
-
-    Collective.
-
-    Args:
-        A: with blocks as large as the dimension.
-        what: its name, the field last.
-        problem: with what is known of cells.
-        lifted: whether -petsc_fs_regularize lifts weak blocks of it.
-
-    Raises:
-        LayoutError: the block size was lost on the way.
-        SceneError: a block is singular to rounding; named with its cell and, if known, contact state.
-    """
-    D = problem.layout.dimension
-    (n, _), _ = A.getSizes()
-    if A.getBlockSize() != D:
-        raise LayoutError(f"{what}: block size is {A.getBlockSize()}, expected {D}")
-    cells = n // D
-    first = A.getOwnershipRange()[0]
-    dense = diagonal_blocks(CSR(*A.getDiagonalBlock().getValuesCSR()), D)
-    with together(problem.layout.comm):
-        bad = np.flatnonzero(singular(dense))
-        if bad.size:
-            cell = int(bad[0])
-            state, name = "", what.rsplit(" ", 1)[-1]
-            if "contact" in what and problem.contact_state is not None:
-                state = f" ({CONTACT_STATES[int(problem.contact_state[cell])]})"
-            raise SceneError(
-                f"{what}: singular at cell {problem.layout.scene_cell(name, first // D + cell)}{state}"
-                + (f", and at {bad.size - 1} more on this rank" if bad.size > 1 else "")
-                + "; the contact unknowns cannot be eliminated"
-                + (f" unless -petsc_fs_regularize (try {REMEDY:g}) lifts it for the preconditioner" if lifted else "")
-            )
-    inverse = np.linalg.inv(dense)
-    columns = first + (np.arange(cells) * D)[:, None, None] + np.zeros((D, 1), dtype=np.int64) + np.arange(D)
-    csr = (
-        (np.arange(n + 1) * D).astype(PETSc.IntType),
-        columns.ravel().astype(PETSc.IntType),
-        inverse.ravel(),
-    )
-    return PETSc.Mat().createAIJ(A.getSizes(), bsize=D, csr=csr, comm=problem.layout.comm)
+def carry_over(A: PETSc.Mat, B: PETSc.Mat) -> None:
+    """Give B the name of A and what is composed on it. Local."""
+    B.setName(A.getName())
+    for what in ("fixed_stress_base", "fixed_stress_ratio", "coordinates"):
+        if (found := A.query(what)) is not None:
+            B.compose(what, found)
+    modes = A.getNearNullSpace()
+    if modes:
+        B.setNearNullSpace(modes)
