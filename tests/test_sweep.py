@@ -38,7 +38,6 @@ BASE = """\
 -ksp_type gmres  # any
 -ksp_rtol 1e-8
 -ksp_pc_side right
--petsc_fs_mat_type aij
 -prefix_push pc_
   -type asm
 -prefix_pop
@@ -478,6 +477,11 @@ def test_two_sweeps_in_a_folder_do_not_mix(tmp_path: Path, made_up: Any) -> None
 
 # --- searches in earnest
 
+FAULTY_BASE = BASE.replace(
+    "-prefix_push", "-pc_type python\n-pc_python_type petsc_fs.pc.Assembled\n-prefix_push assembled_\n-prefix_push"
+)
+FAULTY_BASE = FAULTY_BASE + "-prefix_pop\n"
+
 FAULTY = """\
 base: base.opts
 groups:
@@ -485,15 +489,18 @@ groups:
     parameters:
       which:
         choices:
-          good: {sub_pc_factor_levels: 1}
-          diverging: {pc_type: python, pc_python_type: tests.faulty.Growing, ksp_type: richardson, ksp_divtol: 1e3,
-                      ksp_pc_side: ~, sub_ksp_type: ~, sub_pc_type: ~}
+          good: {assembled_sub_pc_factor_levels: 1}
+          diverging: {pc_python_type: tests.faulty.Growing, ksp_type: richardson, ksp_max_it: 3, ksp_pc_side: ~,
+                      assembled_pc_type: ~, assembled_sub_ksp_type: ~, assembled_sub_pc_type: ~}
           stagnating: {ksp_max_it: 1}
-          crashing: {pc_type: python, pc_python_type: tests.faulty.Crashing, sub_ksp_type: ~, sub_pc_type: ~}
-          hanging: {pc_type: python, pc_python_type: tests.faulty.Hanging, sub_ksp_type: ~, sub_pc_type: ~}
-          hungry: {pc_type: python, pc_python_type: tests.faulty.Hungry, sub_ksp_type: ~, sub_pc_type: ~}
-          misspelt: {sub_pc_factor_levles: 1}
-          impossible: {sub_pc_type: iul}
+          crashing: {pc_python_type: tests.faulty.Crashing, assembled_pc_type: ~, assembled_sub_ksp_type: ~,
+                     assembled_sub_pc_type: ~}
+          hanging: {pc_python_type: tests.faulty.Hanging, assembled_pc_type: ~, assembled_sub_ksp_type: ~,
+                    assembled_sub_pc_type: ~}
+          hungry: {pc_python_type: tests.faulty.Hungry, assembled_pc_type: ~, assembled_sub_ksp_type: ~,
+                   assembled_sub_pc_type: ~}
+          misspelt: {assembled_sub_pc_factor_levles: 1}
+          impossible: {assembled_sub_pc_type: iul}
 """
 
 EXPECTED = {
@@ -512,7 +519,7 @@ def test_each_way_to_fail_is_recorded_as_what_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", str(HERE.parent))
-    make(tmp_path, FAULTY)
+    make(tmp_path, FAULTY, FAULTY_BASE)
     out = tmp_path / "out"
     arguments = ["sweep", "flow.h5", "--space", str(tmp_path / "some.yaml"), "--sampler", "grid", "--trials", "20"]
     arguments += ["--patience", "0", "--time-limit", "10", "--memory-limit", "4", "--finalists", "1", "--confirm", "1"]
@@ -521,7 +528,7 @@ def test_each_way_to_fail_is_recorded_as_what_it_is(
     results = json.loads((out / "sweep.json").read_text())
     assert {t["values"]["all.which"]: t["outcome"] for t in results["trials"]} == EXPECTED
     said = {t["values"]["all.which"]: t["message"] for t in results["trials"]}
-    assert "sub_pc_factor_levels" in said["misspelt"]  # what it might have meant
+    assert "assembled_sub_pc_factor_levels" in said["misspelt"]  # what it might have meant
     assert "SIGSEGV" in said["crashing"]
     assert "within 10 s" in said["hanging"]
     assert results["outcomes"] == dict.fromkeys(EXPECTED.values(), 1)
@@ -530,7 +537,9 @@ def test_each_way_to_fail_is_recorded_as_what_it_is(
     header = options.read_header(out / "best.opts")
     assert header.fields == ("intf_flow", "mass")
     assert not header.default
-    assert options.parse(out / "best.opts") == options.parse(tmp_path / "base.opts") | {"sub_pc_factor_levels": "1"}
+    assert options.parse(out / "best.opts") == options.parse(tmp_path / "base.opts") | {
+        "assembled_sub_pc_factor_levels": "1"
+    }
     for page in (out / "report.md", tmp_path / "page.md"):
         text = page.read_text()
         assert all(kind in text for kind in EXPECTED.values())

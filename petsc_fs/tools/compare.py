@@ -503,7 +503,7 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
 
 def _measure(args: argparse.Namespace, petsc: list[str]) -> Comparison:
     """Measure what the command line asks for, with a line for each process that did not converge."""
-    from petsc_fs.cli.main import find_scene
+    from petsc_fs.io.bundled import find_scene
     from petsc_fs.tools import reference
 
     more_ranks, more = split_ranks(petsc)

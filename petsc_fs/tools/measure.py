@@ -365,7 +365,8 @@ def _explain_end(code: int | None, said: str, time_limit: float, phase: str) -> 
         return "out_of_memory", shortage or f"the system killed the process, as for want of memory; in phase {phase}"
     if number in set(signal.Signals):
         return "crash", f"{signal.Signals(number).name} in phase {phase}"
-    telling = [line for line in lines if re.search("error|exception|abort", line, re.IGNORECASE)] or lines
+    telling = [line for line in lines if re.match(r"[\w.]*(Error|Exception|Exit)\b", line)]
+    telling = telling or [line for line in lines if re.search("error|exception|abort", line, re.IGNORECASE)] or lines
     return "crash", f"exit code {code} in phase {phase}: {telling[-1] if telling else 'no output'}"
 
 
@@ -417,7 +418,7 @@ def environment() -> dict[str, str]:
 
 def describe_machine() -> dict[str, str]:
     """Processor, cores, memory, system and versions that measurements were made with."""
-    from petsc_fs.io import hdf5
+    from petsc_fs.io.bundled import versions
 
     cpuinfo = Path("/proc/cpuinfo")
     said = cpuinfo.read_text(encoding="utf-8") if cpuinfo.exists() else ""
@@ -427,5 +428,5 @@ def describe_machine() -> dict[str, str]:
         "processor": f"{model[0]}, {os.cpu_count()} cores, {memory:.0f} GiB",
         "system": f"{platform.system()} {platform.release()}",
         "threads per rank": environment()["OMP_NUM_THREADS"],
-        "versions": ", ".join(f"{name} {number}" for name, number in hdf5.versions().items()),
+        "versions": ", ".join(f"{name} {number}" for name, number in versions().items()),
     }

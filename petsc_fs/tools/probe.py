@@ -29,7 +29,7 @@ from petsc_fs.tools.measure import DEATH_SIGNAL, MEMORY, Job, Path_, Record
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from petsc_fs.layout import Layout
+    from petsc_fs.partition import Layout
     from petsc_fs.scene import Scene
     from petsc_fs.solver import Result, Solver
 
@@ -48,7 +48,7 @@ def main() -> int:
     job = Job.from_json(Path(sys.argv[1]).read_text(encoding="utf-8"))
     import petsc4py
 
-    petsc4py.init(["petsc-fs", "-options_left", "no"])
+    petsc4py.init(["petsc-fs", "-skip_petscrc", "-options_left", "no"])
     from mpi4py import MPI
 
     comm = MPI.COMM_WORLD
@@ -155,15 +155,11 @@ class Probe:
         self.given = list(self.inserted)
         self.is_sequence = bool(steps)
         self.steps, self.read_seconds = self._timed(lambda: self._read_steps(steps))
-        if self.job.options_file is None:
-            self._insert(defaults(self.steps[0][0], self.comm))
         memory.reset_peak()
         self.base = self.comm.allgather(memory.held())
 
     def _read_steps(self, steps: Sequence[Any]) -> list[tuple[Scene, Layout, float | None]]:
         """The scene, or all of its steps; cells stay on their ranks as long as fields keep their sizes. Collective."""
-        from petsc4py import PETSc
-
         from petsc_fs.io import sequence
         from petsc_fs.io.reader import read_distributed
         from petsc_fs.partition import chosen
@@ -172,11 +168,9 @@ class Probe:
         layout: Layout | None = None
         for step in steps or [None]:
             find: Any = nullcontext if step is None else partial(sequence.find_step, step=step.index)
-            if step is not None and layout is not None and {f: layout.sizes(f)[1] for f in layout.fields} != step.sizes:
+            if step is not None and layout is not None and _sizes(layout) != {f: n for f, n in step.sizes.items() if n}:
                 layout = None
-            scene, layout = read_distributed(
-                self.path, self.comm, *chosen(), layout=layout, index_type=PETSc.IntType, find=find
-            )
+            scene, layout = read_distributed(self.path, self.comm, *chosen(), layout=layout, find=find)
             found.append((scene, layout, None if step is None else step.run.get("forcing")))
         return found
 
@@ -229,8 +223,7 @@ class Probe:
         """A solver that is set up: the last step's, updated, where fields have the same sizes. Collective."""
         from petsc_fs.solver import Solver
 
-        known = self.solver and self.solver.layout
-        if self.solver is not None and known and all(known.sizes(f) == layout.sizes(f) for f in layout.fields):
+        if self.solver is not None and _sizes(self.solver.layout) == _sizes(layout):
             self.solver.update(replace(scene))
         else:
             self._forget()
@@ -251,7 +244,7 @@ class Probe:
         ]
         return {
             "kind": verdict(result),
-            "message": "",
+            "message": "" if result.converged else "; ".join(result.notes),
             "iterations": result.iterations,
             "reason": result.reason,
             "tolerance": result.tolerance,
@@ -264,9 +257,9 @@ class Probe:
         }
 
     def _useless(self) -> str:
-        """What to say of options of the job that nothing asked for, on any rank; "" if there are none. Collective."""
-        names = options.refused([name for name in options.unused() if name in self.given])
-        found = sorted(set().union(*self.comm.allgather(names)))
+        """What to say of options of the job that nothing on any rank asked for; "" if there are none. Collective."""
+        idle = set.intersection(*map(set, self.comm.allgather(options.unused())))
+        found = options.refused(sorted(idle & set(self.given)))
         if not found:
             return ""
         file = options.find_options_file(os.fspath(self.job.options_file)) if self.job.options_file else None
@@ -285,13 +278,8 @@ class Probe:
                     self.log.write({"supplement": number, **self.judge.errors(solution)})
 
 
-def defaults(scene: Scene, comm: MPI.Intracomm) -> dict[str, str | None]:
-    """Options of the smallest solver for a scene, where `Solver` does not choose them by itself. Collective."""
-    try:
-        from petsc_fs.tree import Facts, shipped_tree
-    except ImportError:
-        return {}
-    return dict(shipped_tree(Facts.of(scene, comm)).options)
+def _sizes(layout: Layout) -> dict[str, int]:
+    return {f: layout.sizes(f)[1] for f in layout.fields if layout.sizes(f)[1]}
 
 
 class Judge:

@@ -301,16 +301,14 @@ def _iterative(scene: Scene) -> Iterator[tuple[Solve, str]]:
     from mpi4py import MPI
 
     from petsc_fs.solver import Solver
-    from petsc_fs.tools.probe import defaults
 
     tolerances = {"ksp_rtol": str(INNER_RTOL), "ksp_atol": "0", "ksp_max_it": "500"}
-    with inserted(defaults(scene, MPI.COMM_SELF) | tolerances, PREFIX):
+    with inserted(tolerances, PREFIX):
         solver = Solver(scene, MPI.COMM_SELF, prefix=PREFIX)
 
         def correct(r: Floats) -> Floats:
             size = float(np.linalg.norm(r)) or 1.0
-            solver.update(replace(scene, rhs=by_field(scene, r / size)))
-            found = solver.solve().solution
+            found = solver.solve(rhs=by_field(scene, r / size)).solution
             return size * np.concatenate([found[f] for f in scene.fields])
 
         try:

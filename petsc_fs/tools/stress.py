@@ -326,9 +326,9 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
     """Run `petsc-fs stress`."""
     if comm.size > 1:
         raise UsageError("stress starts mpiexec itself: call it without, and give it -n RANKS")
-    from petsc_fs.cli.main import check_folders
+    from petsc_fs.io.bundled import check_targets
 
-    check_folders(args.report, args.page)
+    check_targets(args.report, args.page)
     numbers, more = split_ranks(petsc)
     cases = _chosen(args)
     if args.list:

@@ -727,7 +727,7 @@ def _settings(args: argparse.Namespace) -> Settings:
     Raises:
         UsageError: they make no sense together, or a package is missing.
     """
-    from petsc_fs.cli.main import find_scene
+    from petsc_fs.io.bundled import find_scene
 
     try:
         import optuna  # noqa: F401
