@@ -8,6 +8,7 @@ from typing import Any
 
 from petsc_fs.system import FieldArrays
 
+
 @dataclass
 class Result:
     """What a solve did.

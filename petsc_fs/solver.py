@@ -10,7 +10,6 @@ import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -24,6 +23,7 @@ from petsc_fs.partition import Layout, chosen, partition
 from petsc_fs.petsc_errors import brief, reason_name, translate
 from petsc_fs.result import Result
 from petsc_fs.scene import Scene
+from petsc_fs.singular import attach, describe, null_vectors
 from petsc_fs.system import EPS, FieldArrays, System, norm
 
 __all__ = ["Result", "Solver"]
@@ -94,7 +94,7 @@ class Solver:
         self.left_out = self._chosen.left_out
         self._retry: _Retry | None = None
         with self._options():
-            self.system = System(self.layout, root_only=root_only, coordinates=needs_coordinates(prefix))
+            self.system = System(self.layout, root_only=root_only, near_null_space=needs_near_null_space(prefix))
             self.system.take(self._scene, release=release)
             self._forget_blocks()
             self.ksp = self._make_ksp(prefix)
@@ -214,6 +214,8 @@ class Solver:
         self.set_up()
         with self._options():
             result = self._run(self.ksp, wanted)
+            if not result.converged:
+                result = self._look_for_null_vectors(result, wanted)
         retry = PETSc.Options(self.prefix).getString("petsc_fs_retry", "none")
         if not result.converged and retry != "none":
             result = self._solve_again(retry, wanted, result)
@@ -253,6 +255,21 @@ class Solver:
             solve_seconds=time.perf_counter() - started,
             solution=solution,
             notes=run.notes,
+        )
+
+    def _look_for_null_vectors(self, result: Result, wanted: float) -> Result:
+        """Where a solve has failed because the system is singular, say so, and solve without its null space. Collective."""
+        vectors = null_vectors(self.system)
+        if not vectors:
+            return result
+        note = describe(self.system, vectors)
+        attach(self.system, self._matrix, vectors)
+        again = self._run(self.ksp, wanted)
+        return replace(
+            again,
+            iterations=result.iterations + again.iterations,
+            solve_seconds=result.solve_seconds + again.solve_seconds,
+            notes=(note + (". Solved for the solution without it" if again.converged else ""), *again.notes),
         )
 
     def _errors(self, solution: FieldArrays) -> dict[str, float]:
@@ -304,14 +321,21 @@ class Solver:
 
 PETSC_ATOL = 1e-50
 """PETSc's own absolute tolerance, which stands for none."""
+MARGIN = 0.3
+"""Part of a tolerance that the Krylov method is given, whose norm is not the user's: without it most solves would
+need a correction, with it they need at most two iterations more."""
+LEAST_RTOL = 1e-12
+"""Tolerance of the Krylov method that its recursion can still keep."""
 WELL_DETERMINED = 1e-3
 """Estimated relative error of each field up to which a solution is taken as it is."""
 DETERMINED = 1e-2
-"""Relative correction of each field up to which a solution counts as one."""
-USUAL = 1e-5
-"""Least singular values of A M^-1 above this occur where only the units of fields differ; they cast no doubt."""
-CORRECTION = 1e-1
-"""Relative tolerance of a correction that measures the error."""
+"""Relative error of each field, where it is measured, up to which a solution counts as one."""
+MEASURE = 0.1
+"""Relative tolerance where errors are measured."""
+MOST_IMPROVEMENTS = 3
+"""Corrections for the sake of the estimated error."""
+LIMIT = 1e-14
+"""Backward error that no correction lessens any more."""
 
 
 class _Run:
@@ -337,7 +361,6 @@ class _Run:
         self.notes: tuple[str, ...] = ()
         self.estimates: dict[str, float] = {}
         self.is_determined = True
-        self._weighted: PETSc.KSP | None = None
         self.x.set(0.0)
         self.check = system.check(self.x, self.r)
         size = norm(self.check.rhs)
@@ -348,64 +371,105 @@ class _Run:
     def first(self) -> None:
         """The Krylov method by its options. Collective."""
         if self.missing > 1.0:
-            self._pass(self.ksp, max(self.rtol, min(self.goal, 0.5)))
+            self._pass(MARGIN * max(self.rtol, min(self.goal, 0.5)))
             self.x.axpy(1.0, self.d)
             self._judge()
 
     def correct(self) -> None:
         """Corrections, as long as each of them halves what is missing. Collective.
 
-        Rounding of the Krylov method's recursion, and norms: it may have stopped where a field has not.
+        The Krylov method stops in the norm of the equilibrated system, by a recursion that rounding may lead astray.
         """
         if self.ksp.getType() == PETSc.KSP.Type.PREONLY:
             return
         while self.missing > 1.0 and self.passes < MOST_PASSES and self.iterations < self.max_it:
-            before, old = self.check, self.missing
-            self._pass(self._weigh(), 0.5)
-            self.x.axpy(1.0, self.d)
-            self._judge()
+            old = self.missing
+            self._pass(min(max(MARGIN / old, LEAST_RTOL), 0.5))
+            self._take_step()
             if self.missing > 0.5 * old:
-                if self.missing > old:
-                    self.x.axpy(-1.0, self.d)
-                    self.check, self.missing = before, old
-                    self.system.check(self.x, self.r)
                 return
 
-    def estimate_error(self) -> None:
-        """Estimate the error of each field, and where that casts doubt, measure it by a correction. Collective.
+    def _take_step(self) -> None:
+        """Add what the last pass has found, unless that makes it worse. Collective."""
+        old = self.missing
+        self.x.axpy(1.0, self.d)
+        self._judge()
+        if self.missing > max(old, 1.0):
+            self.x.axpy(-1.0, self.d)
+            self._judge()
 
-        One application of the preconditioner to the residual is an estimate, over the least singular value that GMRES
-        has seen. A correction solves for the error itself, whatever the preconditioner is worth.
+    def estimate_error(self) -> None:
+        """Estimate the error of each field; where that casts doubt, improve the solution, or measure it. Collective.
+
+        One application of the preconditioner to the residual is an estimate, divided by the least singular value that
+        GMRES has seen. To measure the error is to solve for a residual of this size with a part at random, whatever
+        the preconditioner is worth: a solution that the equations do not determine changes beyond measure.
         """
         if self.missing > 1.0 or not self.passes:
             return
+        least, doubtful = self._least_singular_value(), False
+        for _ in range(MOST_IMPROVEMENTS):
+            self._precondition()
+            steps, eta = self._relative(self.d), max(self.check.backward.values())
+            self.estimates = {f: e / least for f, e in steps.items()}
+            if max(self.estimates.values()) <= WELL_DETERMINED and not doubtful:
+                return
+            step = max(steps.values())
+            final = eta <= LIMIT or self.ksp.getType() == PETSc.KSP.Type.PREONLY
+            if step <= WELL_DETERMINED or final:
+                found, doubtful = self._measured(), True
+                self.estimates = found or self.estimates
+                if found is not None and max(found.values()) <= DETERMINED:
+                    return
+                if final or found is None:
+                    break
+                step = max(found.values())
+            self._pass(min(max(MARGIN * WELL_DETERMINED / step, 1e-4), MARGIN))
+            least = min(least, self._least_singular_value())
+            self._take_step()
+            if self.missing > 1.0 or self.iterations >= self.max_it:
+                break
+        self.is_determined = False
+        found = {f: e for f, e in self.estimates.items() if not e <= DETERMINED} or self.estimates
+        self.notes += (
+            "ill-conditioned: the residual is small, but says little of the error, which is estimated at "
+            + ", ".join(f"{e:.0e} ({f})" for f, e in found.items())
+            + f" of the solution; at most {DETERMINED:g} counts as converged",
+        )
+
+    def _least_singular_value(self) -> float:
+        """The least one of A M^-1 that GMRES has seen, at most 1; 1 for other methods. Local."""
+        if self.ksp.getType() != PETSc.KSP.Type.GMRES or not self.ksp.getIterationNumber():
+            return 1.0
+        return min(1.0, max(float(self.ksp.computeExtremeSingularValues()[1]), EPS))
+
+    def _precondition(self) -> None:
+        """D = M^-1 r. Collective."""
         try:
             self.ksp.getPC().apply(self.r, self.d)
         except (PETSc.Error, ImportError) as e:
             raise translate(e, "the preconditioner failed") from None
-        least = 1.0
-        if self.ksp.getType() == PETSc.KSP.Type.GMRES and self.ksp.getIterationNumber():
-            seen = float(self.ksp.computeExtremeSingularValues()[1])
-            least = max(seen, EPS) if seen < USUAL else 1.0
-        self.estimates = {f: e / least for f, e in self._relative(self.d).items()}
-        if all(e <= WELL_DETERMINED for e in self.estimates.values()):
-            return
-        if self.ksp.getType() != PETSC_PREONLY and self.iterations < self.max_it:
-            self._pass(self._weigh(), CORRECTION)
-            self.estimates = self._relative(self.d)
-            old = self.missing
-            self.x.axpy(1.0, self.d)
-            self._judge()
-            if self.missing > max(1.0, old):
-                self.x.axpy(-1.0, self.d)
-                self._judge()
-        self.is_determined = all(e <= DETERMINED for e in self.estimates.values())
-        if not self.is_determined:
-            found = ", ".join(f"{f} {e:.0e}" for f, e in self.estimates.items() if not e <= DETERMINED)
-            self.notes += (
-                "ill-conditioned: the residual is small, but says little of the error, which is estimated at a part "
-                f"of the solution of {found}; at most {DETERMINED:g} counts as converged",
-            )
+        self._leave_null_space()
+
+    def _leave_null_space(self) -> None:
+        """Take out of `d` what the matrix maps to zero, where that is known. Collective."""
+        space = self.ksp.getOperators()[0].getNullSpace()
+        if space:
+            space.remove(self.d)
+
+    def _measured(self) -> dict[str, float] | None:
+        """Relative size of what a residual of this size may be worth; None if that cannot be solved for. Collective."""
+        system = self.system
+        draw = np.random.default_rng(system.layout.comm.rank)
+        random = {f: draw.standard_normal(v.size) for f, v in system.by_field(self.r).items()}
+        there, sizes = system.norms(system.by_field(self.r)), system.norms(random)
+        parts = [v * (there[f] / (sizes[f] or 1.0)) for f, v in random.items()]
+        kept = self.r.copy()
+        self.r.setArray(self.r.getArray() + np.concatenate(parts))
+        self._pass(MEASURE)
+        kept.copy(self.r)
+        kept.destroy()
+        return self._relative(self.d) if self.reason.startswith("CONVERGED") else None
 
     def _relative(self, part: PETSc.Vec) -> dict[str, float]:
         """Size of each field of a vector beside that of the solution, or beside what would change any equation."""
@@ -414,13 +478,15 @@ class _Run:
         found = self.system.norms(self.system.by_field(part))
         return {f: n / (max(sizes[f], least[f]) or 1.0) for f, n in found.items()}
 
-    def _pass(self, ksp: PETSc.KSP, rtol: float) -> None:
+    def _pass(self, rtol: float) -> None:
         """Run a Krylov method on the present residual; what it finds is in `d`. Collective."""
+        ksp = self.ksp
         ksp.setTolerances(rtol=rtol, atol=0.0, max_it=max(self.max_it - self.iterations, 1))
         try:
             ksp.solve(self.r, self.d)
         except (PETSc.Error, ImportError) as e:
             raise translate(e, "solve failed") from None
+        self._leave_null_space()
         self.passes += 1
         self.iterations += ksp.getIterationNumber()
         self.history.append(np.array(ksp.getConvergenceHistory()))
@@ -444,77 +510,10 @@ class _Run:
             self.check = self.system.check(self.x, self.r, exactly=True)
             self.missing = self.check.excess(self.goal, self.field_goal)
 
-    def _weigh(self) -> PETSc.KSP:
-        """GMRES in the norm in which what is missing counts, with the preconditioner that is there. Collective."""
-        system, check = self.system, self.check
-        size = norm(check.rhs) * self.goal
-        weights = {}
-        for f, terms in check.terms.items():
-            own = self.field_goal * terms
-            wanted = own if check.rounded(f) else min(own, size)
-            weights[f] = 2.0 ** -system.row_scale[f] / wanted if wanted else 1.0
-        parts = [np.full(system.layout.sizes(f)[0], weights[f]) for f in system.layout.fields]
-        context = _Weighted(system.b.duplicate(), self._matrix, self.ksp.getPC())
-        context.w.setArray(np.concatenate(parts))
-        self._end_weighted()
-        comm = system.layout.comm
-        A = PETSc.Mat().createPython(self._matrix.getSizes(), context, comm=comm)
-        A.setUp()
-        ksp = PETSc.KSP().create(comm)
-        ksp.setOperators(A, A)
-        ksp.setType(PETSc.KSP.Type.GMRES)
-        ksp.setGMRESRestart(CORRECTION_RESTART)
-        ksp.setPCSide(PETSc.PC.Side.RIGHT)
-        ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
-        ksp.setConvergenceHistory(reset=True)
-        ksp.getPC().setType("python")
-        ksp.getPC().setPythonContext(context)
-        self._weighted, self._context = ksp, context
-        self.r.pointwiseMult(self.r, context.w)
-        return ksp
-
-    @property
-    def _matrix(self) -> PETSc.Mat:
-        return self.ksp.getOperators()[0]
-
-    def _end_weighted(self) -> None:
-        if self._weighted is not None:
-            self._weighted.destroy()
-            self._context.destroy()
-            self._weighted = None
-
     def destroy(self) -> None:
         """Collective."""
-        self._end_weighted()
         for vector in (self.x, self.r, self.d):
             vector.destroy()
-
-
-CORRECTION_RESTART = 60
-PETSC_PREONLY = PETSc.KSP.Type.PREONLY
-
-
-class _Weighted:
-    """The system with its rows multiplied by weights, and its preconditioner, which need not know of them."""
-
-    def __init__(self, w: PETSc.Vec, A: PETSc.Mat, M: PETSc.PC) -> None:
-        self.w, self.A, self.M = w, A, M
-        self.work = w.duplicate()
-
-    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Y = W A x. Collective."""
-        self.A.mult(x, y)
-        y.pointwiseMult(y, self.w)
-
-    def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Y = M^-1 W^-1 x. Collective."""
-        self.work.pointwiseDivide(x, self.w)
-        self.M.apply(self.work, y)
-
-    def destroy(self, *_: PETSc.Object) -> None:
-        """Collective; may be called several times."""
-        self.w.destroy()
-        self.work.destroy()
 
 
 class _Parts:
@@ -569,7 +568,7 @@ def _set_up(ksp: PETSc.KSP) -> None:
         raise translate(e, "set-up failed") from None
 
 
-def needs_coordinates(prefix: str) -> bool:
+def needs_near_null_space(prefix: str) -> bool:
     """Whether the solver in the options database makes use of rigid-body modes. Local."""
     chosen = {k: str(v) for k, v in PETSc.Options().getAll().items() if k.startswith(prefix)}
     types = {v for k, v in chosen.items() if k.endswith("pc_type")}
@@ -599,4 +598,3 @@ def broken_level(pc: PETSc.PC) -> str:
             hint = f"; if it is MUMPS, raise {prefix}mat_mumps_icntl_14" if kind in ("lu", "cholesky") else ""
             return f"level {prefix} ({kind}) {what}{hint}"
     return ""
-

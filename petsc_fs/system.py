@@ -24,13 +24,15 @@ Floats = NDArray[np.float64]
 FieldArrays = dict[str, Floats]
 Pair = tuple[str, str]
 
-ROUNDS = 10
+ROUNDS = 50
 """Rounds of equilibration between fields, of which there are few."""
 
 
 EPS = 2.0**-52
-ROUNDING_UNITS = 20
+ROUNDING_UNITS = 10
 """A residual of so many units of rounding of the terms of its equations cannot be told from zero."""
+SMALL = 1e-6
+"""Relative residual of the equilibrated system from which rounding is no excuse."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +43,13 @@ class Check:
         residual: |b_f - A_f x|.
         terms: | |A_f| |x| + |b_f| |, or a lower bound of it.
         rhs: |b_f|.
+        balanced: |b - A x| / |b| with the rows of the equilibrated system.
     """
 
     residual: Mapping[str, float]
     terms: Mapping[str, float]
     rhs: Mapping[str, float]
+    balanced: float
 
     @property
     def relative(self) -> float:
@@ -57,15 +61,17 @@ class Check:
         """|b_f - A_f x| / | |A_f| |x| + |b_f| | per field: by how much its equations must be changed to hold."""
         return {f: r / (self.terms[f] or 1.0) for f, r in self.residual.items()}
 
-    def rounded(self, f: str) -> bool:
-        """Whether rounding explains the residual of a field."""
-        return self.residual[f] <= ROUNDING_UNITS * EPS * self.terms[f]
+    @property
+    def rounding(self) -> float:
+        """What rounding may leave of the residual, relative to |b|; 0 where that is not small, whatever the units."""
+        if self.balanced > SMALL:
+            return 0.0
+        return ROUNDING_UNITS * EPS * norm(self.terms) / (norm(self.rhs) or 1.0)
 
     def excess(self, tolerance: float, field_tolerance: float) -> float:
-        """By what factor the tolerances are missed; at most 1 where they are met, but for what rounding explains."""
-        left = {f: 0.0 if self.rounded(f) else r for f, r in self.residual.items()}
-        overall = norm(left) / (norm(self.rhs) or 1.0) / tolerance
-        return max(overall, *(e / field_tolerance for e in self.backward.values()))
+        """By what factor the tolerances are missed; at most 1 where they are met, or rounding forbids it."""
+        overall = self.relative / max(tolerance, self.rounding)
+        return max(overall, *(e / max(field_tolerance, ROUNDING_UNITS * EPS) for e in self.backward.values()))
 
 
 def norm(parts: Mapping[str, float]) -> float:
@@ -90,13 +96,13 @@ class System:
         renewals: how often blocks were made anew because their pattern had changed.
     """
 
-    def __init__(self, layout: Layout, *, root_only: bool = False, coordinates: bool = True) -> None:
+    def __init__(self, layout: Layout, *, root_only: bool = False, near_null_space: bool = True) -> None:
         """Nothing is there yet; see `take`. Local.
 
         Args:
             layout: distribution of the rows, without empty fields.
             root_only: whether scenes are on rank 0 alone; otherwise each rank gives its share of their rows.
-            coordinates: whether displacement fields get the coordinates of their cells, for rigid-body modes.
+            near_null_space: whether displacement fields get their rigid-body modes.
         """
         self.layout = layout
         self.root_only = root_only
@@ -107,7 +113,7 @@ class System:
         self.row_scale = dict.fromkeys(layout.fields, 0)
         self.rhs_scale = 0
         self.block_norms: dict[Pair, float] = {}
-        self._coordinates = coordinates
+        self._near_null_space = near_null_space
         self._patterns: dict[Pair, CSR] = {}
         given = Layout.contiguous(layout.comm, layout.dimension, {f: layout.sizes(f)[1] for f in layout.fields})
         self._shares = {f: given.rows(f) for f in layout.fields}
@@ -142,21 +148,17 @@ class System:
         for name in self.layout.fields:
             self.blocks[name, name].setName(name)
         self._compose(scene)
-        rhs = {f: self.to_layout(f, scene.rhs[f] if scene is not None else None) for f in self.layout.fields}
-        self._equilibrate(rhs)
+        self._equilibrate()
         self.J = nest.nest_of(self.layout.fields, self.blocks, self.layout.comm)
         if old is not None:
             old.destroy()
         if self.b is None:
             self.b = self.J.createVecLeft()
-        self._set_rhs(rhs)
+        self.set_rhs(scene.rhs if scene is not None else None)
 
     def set_rhs(self, rhs: Mapping[str, Floats] | None) -> None:
         """Take a right-hand side, given as in `take`. Collective."""
-        self._set_rhs({f: self.to_layout(f, rhs[f] if rhs else None) for f in self.layout.fields})
-
-    def _set_rhs(self, rhs: FieldArrays) -> None:
-        local = [np.ldexp(rhs[f], self.row_scale[f]) for f in self.layout.fields]
+        local = [np.ldexp(self.to_layout(f, rhs[f] if rhs else None), self.row_scale[f]) for f in self.layout.fields]
         largest = self.layout.comm.allreduce(max(float(np.abs(v).max(initial=0.0)) for v in local), MPI.MAX)
         self.rhs_scale = -math.frexp(largest)[1] if largest else 0
         self.b.setArray(np.ldexp(np.concatenate(local), self.rhs_scale))
@@ -175,7 +177,7 @@ class System:
                     f"block ({r}, {c}): {block.data.size} entries on a rank; "
                     "use more ranks, or a PETSc with 64-bit indices"
                 )
-        if hasattr(scene, 'check_rows'):
+        if hasattr(scene, "check_rows"):
             scene.check_rows()
 
     def _bsize(self, r: str, c: str) -> tuple[int, int]:
@@ -197,25 +199,29 @@ class System:
                 block = csr_rows(block, 0, self._shares[rc[0]][1] - self._shares[rc[0]][0])
             elif scene.rows is None:
                 block = csr_rows(block, *self._shares[rc[0]])
-            self.blocks[rc] = self._from_rows(*rc, block)
-            del block  # before the next one is made
+            given = [block]
+            del block
+            self.blocks[rc] = self._from_rows(*rc, given, keep=not release)
 
-    def _from_rows(self, r: str, c: str, block: CSR) -> PETSc.Mat:
-        comm = self.layout.comm
+    def _from_rows(self, r: str, c: str, given: list[CSR], *, keep: bool) -> PETSc.Mat:
+        """A block from this rank's share of its rows, which is taken out of `given`."""
+        comm, block = self.layout.comm, given.pop()
         sizes = tuple((self._shares[f][1] - self._shares[f][0], self.layout.sizes(f)[1]) for f in (r, c))
-        csr = tuple(part.astype(PETSc.IntType, copy=False) for part in block[:2]) + (block.data,)
+        csr = (*(part.astype(PETSc.IntType, copy=False) for part in block[:2]), block.data)
         if comm.size == 1:
-            given = PETSc.Mat().createAIJWithArrays(sizes, csr, comm=comm)  # a copy of which is faster than insertion
+            matrix = PETSc.Mat().createAIJWithArrays(sizes, csr, comm=comm)  # in these very arrays
         else:
-            given = PETSc.Mat().createAIJ(sizes, csr=csr, comm=comm)
-            if not self._moved:
-                given.setBlockSizes(*self._bsize(r, c))
-                return given
-        if self._moved:
-            matrix = given.createSubMatrix(self._rows[r].numbers, self._rows[c].numbers)
-        else:
-            matrix = given.duplicate(copy=True)
-        given.destroy()
+            matrix = PETSc.Mat().createAIJ(sizes, csr=csr, comm=comm)
+        del block, csr
+        if self._moved or (keep and comm.size == 1):
+            shared = matrix
+            if self._moved:
+                matrix = shared.createSubMatrix(self._rows[r].numbers, self._rows[c].numbers)
+                for kept in (b"SubMatrix", b"ISAllGather"):  # copies for another call of the same kind
+                    nest.call("PetscObjectCompose", matrix, kept, None)
+            else:
+                matrix = shared.duplicate(copy=True)
+            shared.destroy()
         matrix.setBlockSizes(*self._bsize(r, c))
         return matrix
 
@@ -275,7 +281,7 @@ class System:
         with together(comm):
             if scene is not None:
                 coefficients = scene.fixed_stress_coefficients() if "mass" in fields else None
-                centers = {f: v for f, v in scene.cell_centers.items() if f in MECHANICS} if self._coordinates else {}
+                centers = {f: v for f, v in scene.cell_centers.items() if f in MECHANICS}
         known = comm.bcast((coefficients is not None, sorted(centers)))
         if known[0]:
             for k, name in enumerate(("fixed_stress_base", "fixed_stress_ratio")):
@@ -286,9 +292,8 @@ class System:
             if scene is not None:
                 values = self._share(f, scene, centers[f][:, : self.layout.dimension].ravel())
             self.blocks[f, f].compose("coordinates", self._vector(f, values))
-            modes = nest.rigid_body_modes([self.blocks[f, f]])
-            assert modes is not None
-            self.blocks[f, f].setNearNullSpace(modes)
+            if self._near_null_space and (modes := nest.rigid_body_modes([self.blocks[f, f]])) is not None:
+                self.blocks[f, f].setNearNullSpace(modes)
 
     def _vector(self, name: str, values: Floats | None) -> PETSc.Vec:
         vector = self.blocks[name, name].createVecLeft()
@@ -309,16 +314,10 @@ class System:
 
     # Scales
 
-    def _equilibrate(self, rhs: FieldArrays) -> None:
+    def _equilibrate(self) -> None:
         """Multiply the rows of each field by a power of two, so that blocks are alike in size whatever the units."""
         self.block_norms = {rc: block.norm(PETSc.NormType.INFINITY) for rc, block in self.blocks.items()}
         exponents = row_exponents(self.block_norms)
-        largest = np.array([float(np.abs(rhs[f]).max(initial=0.0)) for f in self.layout.fields])
-        self.layout.comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
-        logs = {f: math.log2(v) for f, v in zip(self.layout.fields, largest, strict=True) if v > 0}
-        if logs:
-            b, Rb = max(logs.values()), max(v + exponents[f] for f, v in logs.items())
-            exponents = {f: max(0, round(e + b - Rb)) for f, e in exponents.items()}
         for (r, _), block in self.blocks.items():
             if exponents[r]:
                 block.scale(2.0 ** exponents[r])
@@ -360,11 +359,13 @@ class System:
                 terms[row] += size
             r.setArray(np.concatenate([*residual.values()]))
             found = ({f: np.ldexp(v, -self.row_scale[f]) for f, v in part.items()} for part in (residual, terms, rhs))
-            return Check(*(self.norms(part) for part in found))
+            return Check(*(self.norms(part) for part in found), r.norm() / (self.b.norm() or 1.0))
 
     def least_sizes(self, check: Check, tolerance: float) -> dict[str, float]:
         """Per field the size below which it changes no equation by more than a tolerance of its terms. Local."""
-        limits = {f: [check.terms[r] / n for (r, c), n in self.block_norms.items() if c == f and n] for f in check.terms}
+        limits = {
+            f: [check.terms[r] / n for (r, c), n in self.block_norms.items() if c == f and n] for f in check.terms
+        }
         return {f: tolerance * min(found, default=0.0) for f, found in limits.items()}
 
     def norms(self, arrays: Mapping[str, Floats]) -> dict[str, float]:

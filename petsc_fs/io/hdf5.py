@@ -37,6 +37,7 @@ from petsc_fs.scene import CSR, Material, Metadata, Scene, check_order
 ENCODING = "petsc_fs scene"
 VERSION = 1
 T = TypeVar("T", str, int, float)
+LOCKS = "; wait for it (or HDF5_USE_FILE_LOCKING=FALSE where the file system has no locks)"
 HEAP = b"GCOL"
 HEAPS_WITHIN = 2**24
 """Bytes at the beginning of a file that are looked through for damaged heaps."""
@@ -253,7 +254,7 @@ def open_file(path: Path) -> Iterator[h5py.File]:
             raise SceneError(f"{path}: no permission to read it") from e
         for sign, meaning in (
             ("truncated", "the file is truncated; copy or export it again"),
-            ("lock", "locked: another program has it open for writing; wait for it, or copy the file"),
+            ("to lock file", f"locked: another program has it open for writing{LOCKS}"),
             ("h5clear", f"a program that wrote to it has not closed it; if none does any more, h5clear -s {path.name}"),
         ):
             if sign in str(e):
