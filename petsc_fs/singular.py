@@ -146,7 +146,7 @@ def _unheld(
         noticed = np.abs(product) > NULL * size
         held += np.bincount(_rows(system, r, labels[r])[noticed], minlength=parts)
     system.layout.comm.Allreduce(MPI.IN_PLACE, held, op=MPI.SUM)
-    return held == 0
+    return np.asarray(held == 0)
 
 
 def _maps_to_zero(system: System, v: FieldArrays, *, transposed: bool = False) -> bool:

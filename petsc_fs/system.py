@@ -177,8 +177,7 @@ class System:
                     f"block ({r}, {c}): {block.data.size} entries on a rank; "
                     "use more ranks, or a PETSc with 64-bit indices"
                 )
-        if hasattr(scene, "check_rows"):
-            scene.check_rows()
+        scene.check_rows()
 
     def _bsize(self, r: str, c: str) -> tuple[int, int]:
         return self.layout.block_size(r), self.layout.block_size(c)
@@ -358,8 +357,11 @@ class System:
                     size = np.abs(product)
                 terms[row] += size
             r.setArray(np.concatenate([*residual.values()]))
-            found = ({f: np.ldexp(v, -self.row_scale[f]) for f, v in part.items()} for part in (residual, terms, rhs))
-            return Check(*(self.norms(part) for part in found), r.norm() / (self.b.norm() or 1.0))
+            given = [
+                self.norms({f: np.ldexp(v, -self.row_scale[f]) for f, v in part.items()})
+                for part in (residual, terms, rhs)
+            ]
+        return Check(given[0], given[1], given[2], r.norm() / (self.b.norm() or 1.0))
 
     def least_sizes(self, check: Check, tolerance: float) -> dict[str, float]:
         """Per field the size below which it changes no equation by more than a tolerance of its terms. Local."""

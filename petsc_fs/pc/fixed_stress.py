@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 
+import numpy as np
 from petsc4py import PETSc
 
 from petsc_fs import nest
@@ -56,8 +57,9 @@ class FixedStress(WrapperPC):
         self.kind = choice(pc, "fs_type", kinds)
         self.damping = PETSc.Options(prefix).getReal("fs_damping", PUBLISHED_DAMPING)
         if self.kind == "algebraic":
-            diagonal = block.createVecLeft()
-            diagonal.setArray(stabilisation(*_mechanics(complement, k if whole else None, prefix)))
+            diagonal = block.getDiagonal()  # whose signs are those of the mass balance
+            magnitudes = stabilisation(*_mechanics(complement, k if whole else None, prefix))
+            diagonal.setArray(np.copysign(magnitudes, diagonal.getArray()))
         elif base is not None:
             diagonal = base.copy()
             if ratio is not None:
