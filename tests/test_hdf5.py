@@ -421,6 +421,17 @@ def test_attributes_are_read_as_any_language_writes_them(full, convert):
     assert_same(full_scene(), hdf5.read(full))
 
 
+@pytest.mark.parametrize("kind", ["u8", "u2", ">i4", "i1"])
+def test_integers_of_any_type_become_signed_ones(full, kind):
+    with h5py.File(full, "r+") as file:
+        for name in [f"{MM}/indptr", f"{MM}/indices", "fields/contact/contact_state", "fields/mass/cell_dimension"]:
+            store(name, lambda values: values.astype(kind))(file)
+    scene = hdf5.read(full)
+    assert_same(full_scene(), scene)
+    scene.check_rows()
+    assert scene.blocks["mass", "mass"].indices.dtype in (np.int8, np.int32, np.int64)
+
+
 def test_a_text_that_is_nothing_is_empty(full):
     with h5py.File(full, "r+") as file:
         file.attrs["model"] = h5py.Empty("S1")

@@ -29,6 +29,7 @@ from typing import Any, TypeVar
 import h5py
 import numpy as np
 
+from petsc_fs.csr import whole_numbers
 from petsc_fs.errors import LayoutError, SceneError
 from petsc_fs.fields import FIELD, FIELD_NAMES, in_order
 from petsc_fs.io.files import check_regular, complete
@@ -437,7 +438,9 @@ def _read_block(group: h5py.Group, what: str, start: int, stop: int) -> CSR:
         raise LayoutError(f"{what}: indptr runs to {b}, but there are {values.size} values")
     if stop == pointers.size - 1 and b != values.size:
         raise LayoutError(f"{what}: indptr ends at {b}, but there are {values.size} values")
-    return CSR(indptr - a, columns[a:b], _read_array(values, f"{what}: data", columns.shape, slice(a, b)))
+    return CSR(
+        indptr - a, whole_numbers(columns[a:b], what), _read_array(values, f"{what}: data", columns.shape, slice(a, b))
+    )
 
 
 def _check_block(group: h5py.Group, what: str, shape: tuple[int, int]) -> None:
