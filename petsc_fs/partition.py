@@ -15,7 +15,7 @@ from petsc_fs.fields import FIELD, in_order
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from petsc_fs.scene import CSR, Scene
+    from petsc_fs.scene import Scene
 
 Cells = NDArray[np.int64]
 Floats = NDArray[np.float64]

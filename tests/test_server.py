@@ -173,7 +173,7 @@ import petsc4py; petsc4py.init(["program"])
 from mpi4py import MPI
 from petsc_fs import options, server
 from petsc_fs.io import hdf5
-from petsc_fs.cli.main import find_scene
+from petsc_fs.io.bundled import find_scene
 
 sys.stdout.write(f"rank {MPI.COMM_WORLD.rank} pid {os.getpid()}" + os.linesep)
 client = server.join()

@@ -152,7 +152,9 @@ def test_a_factorisation_alone_is_enough(database):
     assert result.iterations <= 3
 
 
-@pytest.mark.parametrize("rows", [{"mass": 1e-8}, {"mass": 1e8}, {"momentum": 1e-6, "intf_force": 1e-6, "contact": 1e6}], ids=str)
+@pytest.mark.parametrize(
+    "rows", [{"mass": 1e-8}, {"mass": 1e8}, {"momentum": 1e-6, "intf_force": 1e-6, "contact": 1e6}], ids=str
+)
 def test_no_field_hides_behind_the_units_of_another(database, rows):
     scene = load("model2")
     other = replace(scaled(scene, rows=rows), reference=scene.reference)

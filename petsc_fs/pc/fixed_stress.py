@@ -74,8 +74,8 @@ class FixedStress(WrapperPC):
                 f"-{prefix}fs_type analytic: the block of {field} has no vector 'fixed_stress_base' (a scene without "
                 f"material data, cell volumes or cell dimensions has none); use -{prefix}fs_type algebraic"
             )
-        diagonal = block.createVecLeft()
-        diagonal.setArray(values)
+        diagonal = block.getDiagonal()  # whose signs are those of the mass balance
+        diagonal.setArray(np.copysign(values, diagonal.getArray()))
         S = block.duplicate(copy=True)
         S.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)  # the diagonal may be missing from the pattern
         S.setDiagonal(diagonal, addv=PETSc.InsertMode.ADD_VALUES)
