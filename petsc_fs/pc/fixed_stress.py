@@ -130,12 +130,17 @@ def _mechanics(
     A, B, C = (nest.borrowed(complement, handle) for handle in handles[1:4])
     if k is None:
         return A, B, C
-    many = A.getType() == "nest"
-    sizes = [A.getNestSubMatrix(i, i).getSizes()[0] for i in range(A.getNestSize()[0])] if many else [A.getSizes()[0]]
+
+    def sizes(count: int) -> list[tuple[int, int]]:
+        """Of fields of mechanics, or of a single one, which may be a nest itself."""
+        return [A.getNestSubMatrix(i, i).getSizes()[0] for i in range(count)] if count > 1 else [A.getSizes()[0]]
+
     if B.getType() == "nest":
-        parts = [B.getNestSubMatrix(i, k) or nest.empty((n, own), B.comm) for i, n in enumerate(sizes)]
+        rows = sizes(B.getNestSize()[0])
+        parts = [B.getNestSubMatrix(i, k) or nest.empty((n, own), B.comm) for i, n in enumerate(rows)]
         B = PETSc.Mat().createNest([[part] for part in parts], comm=B.comm)
     if C.getType() == "nest":
-        parts = [C.getNestSubMatrix(k, j) or nest.empty((own, n), C.comm) for j, n in enumerate(sizes)]
+        columns = sizes(C.getNestSize()[1])
+        parts = [C.getNestSubMatrix(k, j) or nest.empty((own, n), C.comm) for j, n in enumerate(columns)]
         C = PETSc.Mat().createNest([parts], comm=C.comm)
     return A, B, C
