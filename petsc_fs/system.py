@@ -410,12 +410,12 @@ class _Rows:
 
     def __init__(self, layout: Layout, name: str, share: int | None) -> None:
         """Of a vector in the scene's numbering each rank has `share` rows; None: all of them are on rank 0."""
-        comm, size = layout.comm, layout.block_size(name)
+        comm = layout.comm
         local, total = layout.sizes(name)
         if share is None:
             share = 0 if comm.rank else total
-        cells = layout.own_cells(name).astype(PETSc.IntType)
-        self.numbers = PETSc.IS().createBlock(size, cells, comm=comm)
+        # without a block size, which MatCreateSubMatrix could not give to columns of which a rank needs some components
+        self.numbers = PETSc.IS().createGeneral(layout.own_rows(name).astype(PETSc.IntType), comm=comm)
         self._given = PETSc.Vec().createMPI((share, total), comm=comm)
         self._root = PETSc.Vec().createMPI((0 if comm.rank else total, total), comm=comm)
         self._own = PETSc.Vec().createMPI((local, total), comm=comm)
