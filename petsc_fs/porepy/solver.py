@@ -227,8 +227,8 @@ class FieldSplitSolver:
             where = f"time step {scene.metadata.time_step_index}, Newton step {scene.metadata.newton_index}"
             if action == "raised":
                 raise SolveError(f"{where}: {failure}")
-            said = "the update is used all the same" if action == "accepted" else f"solved again: {result.reason}"
-            logger.warning("%s: %s; %s", where, failure, said)
+            so = "; the update is used all the same" if action == "accepted" else ""
+            logger.warning("%s: %s%s", where, failure, so)
         return update
 
     def check_convergence(self, *args: Any, **kwargs: Any) -> Any:
@@ -265,7 +265,11 @@ class FieldSplitSolver:
 
     def _refuse_unused(self) -> None:
         """Raise a UsageError if an option did nothing; those of PETSC_OPTIONS may be meant for other programs."""
-        useless = options.refused(options.unused())
+        from petsc4py import PETSc
+
+        prefix = self._options_prefix
+        later = PETSc.Options(prefix).getString("petsc_fs_retry", "none") != "none"
+        useless = [n for n in options.refused(options.unused()) if not (later and n.startswith(f"{prefix}retry_"))]
         elsewhere = {name for name in useless if f"-{name}" in os.environ.get("PETSC_OPTIONS", "").split()}
         if elsewhere:
             logger.warning("of PETSC_OPTIONS nothing has asked for -%s", ", -".join(sorted(elsewhere)))
@@ -333,7 +337,7 @@ class FieldSplitSolver:
         first = again.removeprefix(FIRST)
         if result.converged:
             return "retried" if again else "", first
-        failure = f"{result.reason} after {result.iterations} iterations, {result.verdict}"
+        failure = f"{result.verdict} after {result.iterations} iterations ({result.reason})"
         failure = "; ".join([failure, *result.notes])
         if policy != "accept":
             return "raised", failure
