@@ -115,7 +115,7 @@ class Solver:
         if self._scene is not None:
             alone = PETSc.COMM_SELF.tompi4py()
             facts = database.Facts.of(self._scene, alone if self._root_only else comm)
-        return database.choose(comm.bcast(facts) if self._root_only else facts)
+        return database.choose(comm.bcast(facts) if self._root_only or facts is None else facts)
 
     @contextmanager
     def _options(self) -> Iterator[None]:

@@ -669,7 +669,7 @@ def test_options_file_of_a_model(field_split_model, tmp_path):
     file.write_text("-ksp_type gmres\n-ksp_rtoll 1e-3\n-pc_type none\n-ksp_max_it 5\n")
     for name, given, message in (
         ("flow", str(file), r"option -ksp_rtoll from typo.opts was not used; did you mean -ksp_rtol"),
-        ("model1", "flow.opts", r"flow.opts is for models with the fields intf_flow, mass; this one has"),
+        ("model1", "flow.opts", r"flow.opts is for scenes with the fields intf_flow, mass; this one has"),
         ("flow", "nothing.opts", "no such file"),
     ):
         with pytest.raises(UsageError, match=message):

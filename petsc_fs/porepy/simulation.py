@@ -24,9 +24,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-import petsc_fs
 from petsc_fs import options, server
 from petsc_fs.errors import PetscFsError, SolveError, UsageError, portable, together
+from petsc_fs.io.bundled import versions
 from petsc_fs.io.files import write_text
 from petsc_fs.porepy import require_porepy
 from petsc_fs.porepy.cases import CASES, ModelParameters
@@ -83,6 +83,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
     """Run what the arguments of `add_arguments` ask for; progress goes to stderr. Collective.
 
+    On rank 0 `args.summary` then is what the run took.
+
     Raises:
         UsageError: PorePy is missing, there is no such model or parameter, or an option did nothing.
         SolveError: Newton did not converge, or a linear solve failed.
@@ -96,22 +98,20 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
             if parameters.changes():
                 raise UsageError(f"{args.model}: {parameters.changes()}: only the models of this package take these")
         folder = args.out or Path(f"{args.model if is_case else args.model.rpartition(':')[2]}_run")
-        petsc, file = _without_options_file(petsc)
+        given = options.Given.of(petsc)
+        if len(given.files) > 1:
+            raise UsageError("-options_file: a run takes one")
         if comm.rank == 0:
             require_porepy()
             _make_folder(folder)
-    import petsc4py
-
-    petsc4py.init(["petsc-fs", *petsc])
-    options.insert_all({"options_left": "no"})  # newer PETSc would repeat at its end what is said after the first solve
+    given.start(files=False)
     error: BaseException | None = None
     with _terminate_as_interrupt(comm.rank):
         client = server.start(comm) if comm.size > 1 else None
         if comm.rank == 0:
             try:
-                summary = Simulation(args, parameters, folder, file, comm.size).go()
-                sys.stdout.write(_summary_text(summary) + "\n")
-                sys.stdout.flush()
+                file = given.files[0] if given.files else None
+                args.summary = Simulation(args, parameters, folder, file, comm.size).go()
             except BaseException as e:
                 error = e
             finally:
@@ -310,8 +310,6 @@ class Simulation:
             self.notes.append(f"no picture of the contact states: {e}")
 
     def _summary(self, result: str, error: BaseException | None) -> dict[str, Any]:
-        from petsc4py import PETSc
-
         total, records = time.perf_counter() - self._started, self.records
         return {
             "model": self.name,
@@ -330,32 +328,9 @@ class Simulation:
             "files": [*self.files, SUMMARY],
             "notes": self.notes,
             "options_file": None if self.file is None else self.file.name,
-            "options": dict(PETSc.Options().getAll()),
-            "versions": {
-                "petsc_fs": petsc_fs.__version__,
-                "petsc": ".".join(map(str, PETSc.Sys.getVersion())),
-                "porepy": str(require_porepy().__version__),
-            },
+            "options": options.database(),
+            "versions": {**versions(), "porepy": str(require_porepy().__version__)},
         }
-
-
-def _summary_text(summary: dict[str, Any]) -> str:
-    """What a run took, by phase."""
-    total, newton, ranks = summary["seconds"]["total"], summary["newton_steps"], summary["ranks"]
-    states = ", ".join(f"{n} {state}" for state, n in summary["contact_states"].items())
-    lines = [
-        f"{summary['model']}" + (f" ({summary['unknowns']:,} unknowns)" if summary["unknowns"] else ""),
-        *(f"  {name:<15}{v:>10.2f} s{100 * v / total:>5.0f} %" for name, v in summary["seconds"].items()),
-        f"{summary['time_steps']} time steps"
-        + (f" ({summary['time_step_cuts']} cut)" if summary["time_step_cuts"] else "")
-        + f", {newton} Newton steps, {summary['iterations']} Krylov iterations "
-        f"({summary['iterations'] / (newton or 1):.1f} per Newton step) on {ranks} rank{'s' if ranks > 1 else ''}",
-        f"{summary['not_converged']} linear solves did NOT CONVERGE" if summary["not_converged"] else "",
-        f"contact at the last Newton step: {states}" if states else "",
-        *summary["notes"],
-        f"written to {summary['folder']}: {', '.join(summary['files'])}",
-    ]
-    return "\n".join(filter(None, lines))
 
 
 def _timed(name: str, phase: str) -> Any:
@@ -520,29 +495,6 @@ def _expected_time_steps(model: Any, limit: int | None) -> int:
     manager = model.time_manager
     whole = max(round(float(manager.schedule[-1] - manager.schedule[0]) / float(manager.dt)), 1)
     return whole if limit is None else min(whole, limit)
-
-
-def _without_options_file(petsc: list[str]) -> tuple[list[str], Path | None]:
-    """PETSc's arguments without the options file, which goes to the model instead.
-
-    Raises:
-        UsageError: the file cannot be read, or there are two.
-    """
-    rest: list[str] = []
-    file: Path | None = None
-    words = iter(petsc)
-    for word in words:
-        if word != "-options_file":
-            rest.append(word)
-            continue
-        if file is not None:
-            raise UsageError("-options_file: a run takes one")
-        name = next(words, None)
-        if name is None:
-            raise UsageError("-options_file: the name of the file is missing")
-        file = options.find_options_file(name)
-        options.parse(file)
-    return rest, file
 
 
 def _make_folder(folder: Path) -> None:

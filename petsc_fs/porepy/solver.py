@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 
 from petsc_fs import options, server
 from petsc_fs.errors import LayoutError, SolveError, UsageError
-from petsc_fs.fields import in_order
 from petsc_fs.memory import return_freed
 from petsc_fs.porepy.forcing import EisenstatWalker, EisenstatWalkerParameters
 from petsc_fs.scene import Scene, contact_state_counts
@@ -250,13 +249,8 @@ class FieldSplitSolver:
         """Have the options of the file in the database within a block; without one the solver has its default."""
         name = self.params.get("petsc_fs_options_file")
         if name is not None and self._file is None:
-            header = options.read_header(options.find_options_file(str(name)))
-            if not header.fits(scene.fields):
-                raise UsageError(
-                    f"{header.path.name} is for models with the fields {', '.join(header.fields)}; "
-                    f"this one has {', '.join(in_order(scene.fields))}"
-                )
-            self._file, self._values = header.path, options.parse(header.path)
+            self._file = options.fitting_file(str(name), scene.fields)
+            self._values = options.parse(self._file)
         prefix = self._options_prefix
         with options.inserted(self._values, prefix):
             retries = self._option("petsc_fs_on_failure", ON_FAILURE) == "retry"
