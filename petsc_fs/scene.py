@@ -309,7 +309,9 @@ class Scene:
             ends = np.concatenate([[0], np.cumsum(full)])[block.indptr]
             seen = [(("equation", r), ends[1:] > ends[:-1])]
             if self.rows is None:
-                seen.append((("unknown", c), np.bincount(block.indices[full], minlength=self.sizes[c]) > 0))
+                used = np.zeros(self.sizes[c], dtype=bool)
+                used[block.indices[full]] = True
+                seen.append((("unknown", c), used))
             for key, mask in seen:
                 found[key] = found.get(key, False) | mask
         for name in self.fields:

@@ -238,8 +238,9 @@ class System:
                 self._patterns[rc] = block
                 todo.append((rc, not same))
         todo = self.layout.comm.bcast(todo)
-        for rc in set(self.blocks) - {rc for rc, _ in todo}:
+        for rc in sorted(set(self.blocks) - {rc for rc, _ in todo}):
             self.blocks.pop(rc).destroy()
+            self._patterns.pop(rc, None)
         for rc, changed in todo:
             if changed:
                 if rc in self.blocks:
@@ -371,9 +372,18 @@ class System:
         return {f: tolerance * min(found, default=0.0) for f, found in limits.items()}
 
     def norms(self, arrays: Mapping[str, Floats]) -> dict[str, float]:
-        """Euclidean norm of each field over all ranks. Collective."""
-        squares = np.array([np.vdot(arrays[f], arrays[f]) for f in self.layout.fields])
-        return dict(zip(self.layout.fields, np.sqrt(self.layout.comm.allreduce(squares)).tolist(), strict=True))
+        """Euclidean norm of each field over all ranks, also where squares overflow or vanish. Collective."""
+        comm, parts = self.layout.comm, [arrays[f] for f in self.layout.fields]
+        exponents = np.zeros(len(parts), dtype=int)
+        with np.errstate(over="ignore", under="ignore"):
+            squares = comm.allreduce(np.array([np.vdot(v, v) for v in parts]))
+            if not all(1e-280 < s < 1e280 for s in squares):
+                largest = np.array([np.abs(v).max(initial=0.0) for v in parts])
+                comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
+                exponents = np.frexp(largest)[1]
+                parts = [np.ldexp(v, -e) for v, e in zip(parts, exponents, strict=True)]
+                squares = comm.allreduce(np.array([np.vdot(v, v) for v in parts]))
+        return dict(zip(self.layout.fields, np.ldexp(np.sqrt(squares), exponents).tolist(), strict=True))
 
     def gather(self, arrays: Mapping[str, Floats]) -> FieldArrays | None:
         """All rows of each field in the scene's numbering, on rank 0; None elsewhere. Collective."""

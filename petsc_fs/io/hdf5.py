@@ -22,21 +22,23 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields as attributes
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar
 
 import h5py
 import numpy as np
 
+from petsc_fs import __version__
+from petsc_fs.csr import whole_numbers
 from petsc_fs.errors import LayoutError, SceneError
 from petsc_fs.fields import FIELD, FIELD_NAMES, in_order
 from petsc_fs.io.files import check_regular, complete
-from petsc_fs.scene import CSR, Material, Metadata, Scene, check_order
+from petsc_fs.scene import CSR, Integers, Material, Metadata, Scene, check_order
 
 ENCODING = "petsc_fs scene"
 VERSION = 1
 T = TypeVar("T", str, int, float)
+LOCKS = "; wait for it (or HDF5_USE_FILE_LOCKING=FALSE where the file system has no locks)"
 HEAP = b"GCOL"
 HEAPS_WITHIN = 2**24
 """Bytes at the beginning of a file that are looked through for damaged heaps."""
@@ -157,11 +159,7 @@ def write_group(file: h5py.Group, scene: Scene, create: Callable[[h5py.Group, st
 
 def versions() -> dict[str, str]:
     """Version of this package and of the file library."""
-    try:
-        own = version("petsc_fs")
-    except PackageNotFoundError:
-        own = "unknown"
-    return {"petsc_fs": own, "h5py": h5py.version.version, "hdf5": h5py.version.hdf5_version}
+    return {"petsc_fs": __version__, "h5py": h5py.version.version, "hdf5": h5py.version.hdf5_version}
 
 
 def read_sizes(path: str | os.PathLike[str]) -> tuple[int, dict[str, int]]:
@@ -220,10 +218,10 @@ def read_group(
         for c, block in row.items():
             if r not in sizes or c not in sizes:
                 raise LayoutError(f"block ({r}, {c}): the scene has no field {r if r not in sizes else c!r}")
-            _check_block(block, f"block ({r}, {c})", (sizes[r], sizes[c]))
+            read_rows = partial(_read_block, block, f"block ({r}, {c})", (sizes[r], sizes[c]))
             if r == c and rows is not None:  # a whole scene is asked for it when it is there
-                check_order(r, dimension, sizes[r], partial(_read_block, block, f"block ({r}, {c})"))
-            blocks[r, c] = _read_block(block, f"block ({r}, {c})", *ranges[r])
+                check_order(r, dimension, sizes[r], read_rows)
+            blocks[r, c] = read_rows(*ranges[r])
     scene = Scene(
         dimension=dimension,
         sizes=sizes,
@@ -253,7 +251,7 @@ def open_file(path: Path) -> Iterator[h5py.File]:
             raise SceneError(f"{path}: no permission to read it") from e
         for sign, meaning in (
             ("truncated", "the file is truncated; copy or export it again"),
-            ("lock", "locked: another program has it open for writing; wait for it, or copy the file"),
+            ("to lock file", f"locked: another program has it open for writing{LOCKS}"),
             ("h5clear", f"a program that wrote to it has not closed it; if none does any more, h5clear -s {path.name}"),
         ):
             if sign in str(e):
@@ -403,12 +401,18 @@ def check_storage(group: h5py.Group, depth: int = 3) -> int:
 
 
 def _read_array(dataset: h5py.Dataset, what: str, shape: tuple[int, ...], part: slice, real: bool = True) -> Any:
-    """Part of a dataset, whose shape and kind must be right; as double if `real`."""
-    if dataset.shape != shape:
-        raise LayoutError(f"{what} has shape {dataset.shape}, expected {shape}")
+    """Part of a dataset of a shape, as double if `real`; also of a column or a row."""
     if dataset.dtype.kind not in "biuf":
         raise SceneError(f"the scene is damaged ({what}: expected real numbers)")
-    return dataset[part].astype(np.float64, copy=False) if real else dataset[part]
+    if dataset.shape == shape:
+        values = dataset[part]
+    elif dataset.shape == (*shape, 1):
+        values = dataset[part, 0]
+    elif dataset.shape == (1, *shape):
+        values = dataset[0, part]
+    else:
+        raise LayoutError(f"{what} has shape {dataset.shape}, expected {shape}")
+    return values.astype(np.float64, copy=False) if real else values
 
 
 def read_metadata(file: h5py.Group) -> Metadata:
@@ -424,35 +428,35 @@ def read_metadata(file: h5py.Group) -> Metadata:
     )
 
 
-def _read_block(group: h5py.Group, what: str, start: int, stop: int) -> CSR:
-    pointers, columns, values = (group[name] for name in CSR._fields)
-    indptr = pointers[start : stop + 1].astype(np.int64)
-    a, b = int(indptr[0]), int(indptr[-1])
-    if start == 0 and a != 0:
-        raise LayoutError(f"{what}: indptr starts at {a}, expected 0")
-    if (np.diff(indptr) < 0).any():
-        raise LayoutError(f"{what}: indptr must start at 0 and not decrease")
-    if not 0 <= a <= b <= values.size:
-        raise LayoutError(f"{what}: indptr runs to {b}, but there are {values.size} values")
-    if stop == pointers.size - 1 and b != values.size:
-        raise LayoutError(f"{what}: indptr ends at {b}, but there are {values.size} values")
-    return CSR(indptr - a, columns[a:b], _read_array(values, f"{what}: data", columns.shape, slice(a, b)))
-
-
-def _check_block(group: h5py.Group, what: str, shape: tuple[int, int]) -> None:
-    """The shapes and kinds of the datasets of a block."""
+def _read_block(group: h5py.Group, what: str, shape: tuple[int, int], start: int, stop: int) -> CSR:
+    """Rows start:stop of a block of a shape."""
     encoding, found = attribute(group, "encoding-type", str), tuple(np.ravel(group.attrs["shape"]).tolist())
     if encoding != "csr_matrix":
         raise LayoutError(f"{what}: encoding-type is {encoding!r}, expected 'csr_matrix'")
     if found != shape:
         raise LayoutError(f"{what}: shape is {found}, expected {shape}")
     pointers, columns, values = (group[name] for name in CSR._fields)
-    if pointers.dtype.kind not in "iu" or columns.dtype.kind not in "iu":
-        raise LayoutError(f"{what}: indptr and indices must be integers")
-    if pointers.shape != (shape[0] + 1,):
+    size = int(values.size)
+    if pointers.size != shape[0] + 1:
         raise LayoutError(f"{what}: indptr has {pointers.size} entries, expected {shape[0] + 1}")
-    if columns.ndim != 1 or columns.shape != values.shape:
-        raise LayoutError(f"{what}: {columns.size} indices but {values.size} values")
+    if columns.size != size:
+        raise LayoutError(f"{what}: {columns.size} indices but {size} values")
+
+    def integers(dataset: h5py.Dataset, a: int, b: int) -> Integers:
+        found = _read_array(dataset, f"{what}: indptr and indices", (int(dataset.size),), slice(a, b), real=False)
+        return whole_numbers(found, f"{what}: indptr and indices")
+
+    indptr = integers(pointers, start, stop + 1).astype(np.int64)
+    a, b = int(indptr[0]), int(indptr[-1])
+    if start == 0 and a != 0:
+        raise LayoutError(f"{what}: indptr starts at {a}, expected 0")
+    if (np.diff(indptr) < 0).any():
+        raise LayoutError(f"{what}: indptr must start at 0 and not decrease")
+    if not 0 <= a <= b <= size:
+        raise LayoutError(f"{what}: indptr runs to {b}, but there are {size} values")
+    if stop == shape[0] and b != size:
+        raise LayoutError(f"{what}: indptr ends at {b}, but there are {size} values")
+    return CSR(indptr - a, integers(columns, a, b), _read_array(values, f"{what}: data", (size,), slice(a, b)))
 
 
 def _read_material(group: h5py.Group, size: int, part: slice) -> Material:

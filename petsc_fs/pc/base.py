@@ -42,9 +42,12 @@ class BasePC(ABC):
 
     inners: tuple[PETSc.PC, ...] = ()
 
+    def create(self, pc: PETSc.PC) -> None:
+        """Note that the PC is there: it may never be set up, where another one fails. Local."""
+        _alive[pc.handle] = None
+
     def setUp(self, pc: PETSc.PC) -> None:
         """Take a new matrix. Collective."""
-        _alive[pc.handle] = None
         self.update(pc)
 
     @abstractmethod
