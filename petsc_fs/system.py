@@ -413,7 +413,9 @@ class _Rows:
         if share is None:
             share = 0 if comm.rank else total
         cells = layout.own_cells(name).astype(PETSc.IntType)
-        self.numbers = PETSc.IS().createBlock(size, cells, comm=comm)
+        numbers = (size * cells[:, None] + np.arange(size, dtype=PETSc.IntType)).ravel()
+        # without a block size: MatCreateSubMatrix gives it to the columns that a rank needs, whatever their number
+        self.numbers = PETSc.IS().createGeneral(numbers, comm=comm)
         self._given = PETSc.Vec().createMPI((share, total), comm=comm)
         self._root = PETSc.Vec().createMPI((0 if comm.rank else total, total), comm=comm)
         self._own = PETSc.Vec().createMPI((local, total), comm=comm)
