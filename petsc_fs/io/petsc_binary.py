@@ -4,6 +4,8 @@ FOLDER/matrix.petsc          the Jacobian, one AIJ, fields one after the other
 FOLDER/rhs.petsc             right-hand side
 FOLDER/reference.petsc       reference solution, if known
 FOLDER/fields/NAME.petsc     index set: rows and columns of the field in the matrix
+FOLDER/fields/NAME.WHAT.petsc  vector over these rows that PCs look for, composed as WHAT on the block of the field:
+                             fixed_stress_base and fixed_stress_ratio of mass, coordinates of displacements
 FOLDER/scene.h5              what this format has no place for: cell data, material, units
 
 A file is integers and numbers, big-endian: a matrix 1211216, rows, columns, entries (-1 if dense), the number of
@@ -21,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petsc_fs.errors import SceneError, UsageError
-from petsc_fs.fields import FIELD_NAMES
+from petsc_fs.fields import FIELD_NAMES, MECHANICS
+from petsc_fs.fixed_stress import analytic_coefficients
 from petsc_fs.io import hdf5
 from petsc_fs.io.files import check_regular, complete
 from petsc_fs.scene import CSR, Integers, Scene
@@ -55,8 +58,8 @@ def from_scene(source: Path, folder: Path) -> list[Path]:
         (folder / FIELDS).mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise UsageError(f"{folder}: cannot be made: {e.strerror}") from e
-    for stale in [REFERENCE, *(f"{FIELDS}/{name}.petsc" for name in FIELD_NAMES)]:
-        (folder / stale).unlink(missing_ok=True)
+    for stale in [folder / REFERENCE, *(f for name in FIELD_NAMES for f in (folder / FIELDS).glob(f"{name}.*petsc"))]:
+        stale.unlink(missing_ok=True)
     written = []
 
     def store(name: str, kind: str, *content: Any) -> None:
@@ -76,8 +79,19 @@ def from_scene(source: Path, folder: Path) -> list[Path]:
     for name, size in ((f, scene.sizes[f]) for f in scene.fields):
         store(f"{FIELDS}/{name}.petsc", "index set", [size], np.arange(start, start + size))
         start += size
+        for what, values in companions(scene, name).items():
+            store(f"{FIELDS}/{name}.{what}.petsc", "vector", [size], values)
     written.append(hdf5.write(replace(scene, blocks={}, reference={}), folder / REST))
     return written
+
+
+def companions(scene: Scene, name: str) -> dict[str, NDArray[np.float64]]:
+    """Vectors over the rows of a field that PCs look for, by the names they are composed under; see `petsc_fs.nest`."""
+    if name == "mass" and (coefficients := analytic_coefficients(scene)) is not None:
+        return {"fixed_stress_base": coefficients[:, 0], "fixed_stress_ratio": coefficients[:, 1]}
+    if name in MECHANICS and name in scene.cell_centers:
+        return {"coordinates": scene.cell_centers[name][:, : scene.dimension].ravel()}
+    return {}
 
 
 def _whole(scene: Scene) -> tuple[Integers, Integers, NDArray[np.float64]]:
