@@ -70,10 +70,13 @@ class BasePC(ABC):
 
     inners: tuple[PETSc.PC, ...] = ()
 
+    def create(self, pc: PETSc.PC) -> None:
+        """Note that there is such a PC. Local."""
+        _alive[pc.handle] = None
+
     @told
     def setUp(self, pc: PETSc.PC) -> None:
         """Take a new matrix. Collective."""
-        _alive[pc.handle] = None
         self.update(pc)
 
     @abstractmethod
