@@ -68,7 +68,7 @@ fem_petsc.set_bc(parts, fem.bcs_by_block(fem.extract_function_spaces(rhs_form), 
 momentum, mass = A.getNestSubMatrix(0, 0), A.getNestSubMatrix(1, 1)
 momentum.setName("momentum")
 mass.setName("mass")
-if not options.hasName("no_fixed_stress"):
+if not options.hasName("algebraic"):  # else FixedStress makes do with the matrix
     lumped = fem_petsc.assemble_vector(fem.form(q * ufl.dx))  # the integrals of the hat functions
     lumped.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
     base, ratio = mass.createVecLeft(), mass.createVecLeft()
