@@ -8,6 +8,7 @@ from typing import Any
 
 from petsc_fs.system import FieldArrays
 
+
 @dataclass
 class Result:
     """What a solve did.
@@ -27,6 +28,8 @@ class Result:
         true_relative_residual: |b - A x| / |b|.
         residual_by_field: |b_f - A_f x| / |b|.
         backward_error_by_field: |b_f - A_f x| / | |A_f| |x| + |b_f| |, or a little more.
+        estimated_error_by_field: an estimate of the relative error: of one correction by the preconditioner, or by the
+            Krylov method where that cast doubt. Empty where the residual is not small.
         error_by_field: |x - reference| / |reference|, where a reference is known; the absolute error where that is 0.
         passes: how often the Krylov method ran: once, and once more for each correction.
         setup_seconds: building PETSc's matrices and setting the preconditioner up, for this solve.
@@ -44,6 +47,7 @@ class Result:
     true_relative_residual: float
     residual_by_field: dict[str, float]
     backward_error_by_field: dict[str, float]
+    estimated_error_by_field: dict[str, float]
     error_by_field: dict[str, float]
     passes: int
     setup_seconds: float

@@ -10,7 +10,7 @@ import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
+
 
 import numpy as np
 from mpi4py import MPI
@@ -24,11 +24,10 @@ from petsc_fs.partition import Layout, chosen, partition
 from petsc_fs.petsc_errors import brief, reason_name, translate
 from petsc_fs.result import Result
 from petsc_fs.scene import Scene
-from petsc_fs.system import FieldArrays, System, norm
+from petsc_fs.system import EPS, FieldArrays, System, norm
 
 __all__ = ["Result", "Solver"]
 
-MAT_TYPES = ("nest", "aij")
 MOST_PASSES = 20
 """The Krylov method and its corrections; each has to halve what is missing."""
 NOT_FINITE = ("DIVERGED_NANORINF", "DIVERGED_PCSETUP_FAILED", "DIVERGED_PC_FAILED")
@@ -41,7 +40,6 @@ class Solver:
     Where the database chooses no preconditioner (`-pc_type`), the default options file for the scene's fields does.
 
     Options:
-        -petsc_fs_mat_type nest|aij: storage of the Jacobian; aij copies the blocks into one matrix.
         -petsc_fs_partition, -petsc_fs_ordering: see `petsc_fs.partition.partition`.
         -petsc_fs_retry FILE|none: options file of a second solve, where the first has not converged; its options have
             the prefix retry_. Default none.
@@ -99,9 +97,7 @@ class Solver:
             self.system = System(self.layout, root_only=root_only, coordinates=needs_coordinates(prefix))
             self.system.take(self._scene, release=release)
             self._forget_blocks()
-            self._mat_type = mat_type(prefix)
-            self._matrix = self._make_matrix(self._mat_type)
-            self.ksp = self._make_ksp(self._matrix, prefix)
+            self.ksp = self._make_ksp(prefix)
         tolerances = self.ksp.getTolerances()
         self.rtol, self._atol = float(tolerances[0]), float(tolerances[1])
         self._finalizer = weakref.finalize(self, _dropped.__setitem__, next(_numbers), _Parts(self))
@@ -141,16 +137,16 @@ class Solver:
             if collecting:
                 gc.enable()
 
-    def _make_matrix(self, kind: str) -> PETSc.Mat:
-        """What the KSP works on: the nest itself, or a copy in one matrix. Collective."""
-        if len(self.layout.fields) == 1:
-            return self.system.blocks[self.layout.fields[0], self.layout.fields[0]]
-        return nest.one_matrix(self.system.J) if kind == "aij" else self.system.J
+    @property
+    def _matrix(self) -> PETSc.Mat:
+        """What the KSP works on: the nest, or the only block."""
+        fields = self.layout.fields
+        return self.system.J if len(fields) > 1 else self.system.blocks[fields[0], fields[0]]
 
-    def _make_ksp(self, matrix: PETSc.Mat, prefix: str) -> PETSc.KSP:
+    def _make_ksp(self, prefix: str) -> PETSc.KSP:
         ksp = PETSc.KSP().create(self.layout.comm)
         ksp.setOptionsPrefix(prefix)
-        ksp.setOperators(matrix, matrix)
+        ksp.setOperators(self._matrix, self._matrix)
         nest.give_fields(ksp)
         try:
             ksp.setFromOptions()
@@ -158,6 +154,8 @@ class Solver:
             ksp.destroy()
             raise UsageError(f"PETSc refuses an option: {brief(e)}") from e
         ksp.setConvergenceHistory(reset=True)
+        if ksp.getType() == PETSc.KSP.Type.GMRES:
+            ksp.setComputeSingularValues(True)  # of what it projects anyway
         return ksp
 
     def update(self, scene: Scene | None) -> None:
@@ -171,14 +169,10 @@ class Solver:
         started = time.perf_counter()
         _destroy_dropped(self.layout.comm)
         self._scene = self._part(scene)
-        before = self._matrix if self._matrix is not self.system.J else None
         with self._options():
             self.system.take(self._scene)
             self._forget_blocks()
-            self._matrix = self._make_matrix(self._mat_type)
             self.ksp.setOperators(self._matrix, self._matrix)
-        if before is not None and len(self.layout.fields) > 1:
-            before.destroy()
         self._drop_retry()
         PETSc.garbage_cleanup(self.layout.comm)
         self._built_seconds = time.perf_counter() - started
@@ -230,66 +224,35 @@ class Solver:
     def _run(self, ksp: PETSc.KSP, wanted: float) -> Result:
         """The Krylov method and its corrections, and what comes of them. Collective."""
         started = time.perf_counter()
-        system, max_it = self.system, ksp.getTolerances()[3]
-        atol = math.ldexp(self._atol, system.rhs_scale) if self._atol > PETSC_ATOL else 0.0
-        x, r, d = (system.b.duplicate() for _ in range(3))
-        x.set(0.0)
-        system.b.copy(r)
-        check, iterations, passes, reason = system.check(x, r), 0, 0, "CONVERGED_ATOL"
-        goal = max(wanted, atol / size) if (size := norm(check.rhs)) else 1.0
-        field_goal = field_tolerance(wanted)
-        aim, history = wanted, []
+        system = self.system
+        run = _Run(system, ksp, wanted, self._atol if self._atol > PETSC_ATOL else 0.0)
         try:
-            while check.excess(goal, field_goal) > 1.0 and passes < MOST_PASSES and iterations < max_it:
-                ksp.setTolerances(rtol=aim, atol=0.0, max_it=max_it - iterations)
-                try:
-                    ksp.solve(r, d)
-                except (PETSc.Error, ImportError) as e:
-                    raise translate(e, "solve failed") from None
-                passes += 1
-                iterations += ksp.getIterationNumber()
-                history.append(np.asarray(ksp.getConvergenceHistory()))
-                reason = reason_name(ksp)
-                x.axpy(1.0, d)
-                latest = system.check(x, r)
-                if not math.isfinite(latest.excess(goal, field_goal)):
-                    where = broken_level(ksp.getPC()) if passes == 1 or reason in NOT_FINITE else ""
-                    raise SolveError(
-                        f"the solution is not finite after {iterations} iterations ({reason})" + (where and f"; {where}")
-                    )
-                if latest.excess(goal, field_goal) > 1.0:
-                    latest = system.check(x, r, exactly=True)
-                missing = latest.excess(goal, field_goal)
-                if passes > 1 and missing > 0.5 * check.excess(goal, field_goal):
-                    if missing > check.excess(goal, field_goal):
-                        x.axpy(-1.0, d)
-                        latest = system.check(x, r, exactly=True)
-                    check = latest
-                    break
-                check = latest
-                aim = min(0.5, max(0.5 / missing, 1e-12)) if missing > 0 else 0.5
+            run.first()
+            run.correct()
+            run.estimate_error()
+            self._history = np.concatenate(run.history) if run.history else np.zeros(0)
+            solution = {f: np.ldexp(v, -system.rhs_scale) for f, v in system.by_field(run.x).items()}
         finally:
-            ksp.setTolerances(rtol=self.rtol, atol=self._atol, max_it=max_it)
-        self._history = np.concatenate([[*h] for h in history]) if history else np.zeros(0)
-        solution = {f: np.ldexp(v, -system.rhs_scale) for f, v in system.by_field(x).items()}
-        for vector in (x, r, d):
-            vector.destroy()
-        excess = check.excess(goal, field_goal)
+            run.destroy()
+            ksp.setTolerances(rtol=self.rtol, atol=self._atol, max_it=run.max_it)
+        check, size = run.check, norm(run.check.rhs)
         return Result(
-            iterations=iterations,
-            converged=excess <= 1.0,
-            reason=reason,
+            iterations=run.iterations,
+            converged=run.missing <= 1.0 and run.is_determined,
+            reason=run.reason,
             rtol=wanted,
-            tolerance=goal,
-            field_tolerance=field_goal,
+            tolerance=run.goal,
+            field_tolerance=run.field_goal,
             true_relative_residual=check.relative,
             residual_by_field={f: n / (size or 1.0) for f, n in check.residual.items()},
             backward_error_by_field=check.backward,
+            estimated_error_by_field=run.estimates,
             error_by_field=self._errors(solution),
-            passes=passes,
+            passes=run.passes,
             setup_seconds=0.0,
             solve_seconds=time.perf_counter() - started,
             solution=solution,
+            notes=run.notes,
         )
 
     def _errors(self, solution: FieldArrays) -> dict[str, float]:
@@ -341,11 +304,191 @@ class Solver:
 
 PETSC_ATOL = 1e-50
 """PETSc's own absolute tolerance, which stands for none."""
+MARGIN = 0.3
+"""Part of a tolerance that the Krylov method is given, whose norm is not the user's: without it most solves would
+need a correction, with it they need at most two iterations more."""
+LEAST_RTOL = 1e-12
+"""Tolerance of the Krylov method that its recursion can still keep."""
+WELL_DETERMINED = 1e-3
+"""Estimated relative error of each field up to which a solution is taken as it is."""
+DETERMINED = 1e-2
+"""Relative error of each field, where it is measured, up to which a solution counts as one."""
+MEASURE = 0.1
+"""Relative tolerance where errors are measured."""
+MOST_IMPROVEMENTS = 3
+"""Corrections for the sake of the estimated error."""
+LIMIT = 1e-14
+"""Backward error that no correction lessens any more."""
 
 
-def field_tolerance(rtol: float) -> float:
-    """Backward error that each field may have."""
-    return rtol
+class _Run:
+    """One solve: a Krylov method on the equilibrated system, and corrections as the user's system asks for them.
+
+    Attributes:
+        x: the solution so far, of the system as it is in PETSc.
+        check: how well it satisfies the user's system.
+        missing: by what factor it misses the tolerances.
+        goal: tolerance of the residual, relative to |b|.
+        field_goal: backward error that each field may have.
+        estimates: estimated relative error of each field.
+        is_determined: whether the equations determine the solution to `DETERMINED`.
+    """
+
+    def __init__(self, system: System, ksp: PETSc.KSP, rtol: float, atol: float) -> None:
+        self.system, self.ksp, self.rtol = system, ksp, rtol
+        self.x, self.r, self.d = (system.b.duplicate() for _ in range(3))
+        self.max_it = int(ksp.getTolerances()[3])
+        self.iterations = self.passes = 0
+        self.reason = "CONVERGED_ATOL"
+        self.history: list[NDArray[np.float64]] = []
+        self.notes: tuple[str, ...] = ()
+        self.estimates: dict[str, float] = {}
+        self.is_determined = True
+        self.x.set(0.0)
+        self.check = system.check(self.x, self.r)
+        size = norm(self.check.rhs)
+        self.goal = max(rtol, math.ldexp(atol, system.rhs_scale) / size) if size else 1.0
+        self.field_goal = rtol
+        self.missing = self.check.excess(self.goal, self.field_goal) if size else 0.0
+
+    def first(self) -> None:
+        """The Krylov method by its options. Collective."""
+        if self.missing > 1.0:
+            self._pass(MARGIN * max(self.rtol, min(self.goal, 0.5)))
+            self.x.axpy(1.0, self.d)
+            self._judge()
+
+    def correct(self) -> None:
+        """Corrections, as long as each of them halves what is missing. Collective.
+
+        The Krylov method stops in the norm of the equilibrated system, by a recursion that rounding may lead astray.
+        """
+        if self.ksp.getType() == PETSc.KSP.Type.PREONLY:
+            return
+        while self.missing > 1.0 and self.passes < MOST_PASSES and self.iterations < self.max_it:
+            old = self.missing
+            self._pass(min(max(MARGIN / old, LEAST_RTOL), 0.5))
+            self._take_step()
+            if self.missing > 0.5 * old:
+                return
+
+    def _take_step(self) -> None:
+        """Add what the last pass has found, unless that makes it worse. Collective."""
+        old = self.missing
+        self.x.axpy(1.0, self.d)
+        self._judge()
+        if self.missing > max(old, 1.0):
+            self.x.axpy(-1.0, self.d)
+            self._judge()
+
+    def estimate_error(self) -> None:
+        """Estimate the error of each field; where that casts doubt, improve the solution, or measure it. Collective.
+
+        One application of the preconditioner to the residual is an estimate, divided by the least singular value that
+        GMRES has seen. To measure the error is to solve for a residual of this size with a part at random, whatever
+        the preconditioner is worth: a solution that the equations do not determine changes beyond measure.
+        """
+        if self.missing > 1.0 or not self.passes:
+            return
+        least, doubtful = self._least_singular_value(), self.system.has_weak_pivots()
+        for _ in range(MOST_IMPROVEMENTS):
+            self._precondition()
+            steps, eta = self._relative(self.d), max(self.check.backward.values())
+            self.estimates = {f: e / least for f, e in steps.items()}
+            if max(self.estimates.values()) <= WELL_DETERMINED and not doubtful:
+                return
+            step = max(steps.values())
+            final = eta <= LIMIT or self.ksp.getType() == PETSc.KSP.Type.PREONLY
+            if step <= WELL_DETERMINED or final:
+                found, doubtful = self._measured(), True
+                self.estimates = found or self.estimates
+                if found is not None and max(found.values()) <= DETERMINED:
+                    return
+                if final or found is None:
+                    break
+                step = max(found.values())
+            self._pass(min(max(MARGIN * WELL_DETERMINED / step, 1e-4), MARGIN))
+            least = min(least, self._least_singular_value())
+            self._take_step()
+            if self.missing > 1.0 or self.iterations >= self.max_it:
+                break
+        self.is_determined = False
+        found = {f: e for f, e in self.estimates.items() if not e <= DETERMINED} or self.estimates
+        self.notes += (
+            "ill-conditioned: the residual is small, but says little of the error, which is estimated at "
+            + ", ".join(f"{e:.0e} ({f})" for f, e in found.items())
+            + f" of the solution; at most {DETERMINED:g} counts as converged",
+        )
+
+    def _least_singular_value(self) -> float:
+        """The least one of A M^-1 that GMRES has seen, at most 1; 1 for other methods. Local."""
+        if self.ksp.getType() != PETSc.KSP.Type.GMRES or not self.ksp.getIterationNumber():
+            return 1.0
+        return min(1.0, max(float(self.ksp.computeExtremeSingularValues()[1]), EPS))
+
+    def _precondition(self) -> None:
+        """D = M^-1 r. Collective."""
+        try:
+            self.ksp.getPC().apply(self.r, self.d)
+        except (PETSc.Error, ImportError) as e:
+            raise translate(e, "the preconditioner failed") from None
+
+    def _measured(self) -> dict[str, float] | None:
+        """Relative size of what a residual of this size may be worth; None if that cannot be solved for. Collective."""
+        system = self.system
+        draw = np.random.default_rng(system.layout.comm.rank)
+        random = {f: draw.standard_normal(v.size) for f, v in system.by_field(self.r).items()}
+        there, sizes = system.norms(system.by_field(self.r)), system.norms(random)
+        parts = [v * (there[f] / (sizes[f] or 1.0)) for f, v in random.items()]
+        kept = self.r.copy()
+        self.r.setArray(self.r.getArray() + np.concatenate(parts))
+        self._pass(MEASURE)
+        kept.copy(self.r)
+        kept.destroy()
+        return self._relative(self.d) if self.reason.startswith("CONVERGED") else None
+
+    def _relative(self, part: PETSc.Vec) -> dict[str, float]:
+        """Size of each field of a vector beside that of the solution, or beside what would change any equation."""
+        sizes = self.system.norms(self.system.by_field(self.x))
+        least = self.system.least_sizes(self.check, self.field_goal)
+        found = self.system.norms(self.system.by_field(part))
+        return {f: n / (max(sizes[f], least[f]) or 1.0) for f, n in found.items()}
+
+    def _pass(self, rtol: float) -> None:
+        """Run a Krylov method on the present residual; what it finds is in `d`. Collective."""
+        ksp = self.ksp
+        ksp.setTolerances(rtol=rtol, atol=0.0, max_it=max(self.max_it - self.iterations, 1))
+        try:
+            ksp.solve(self.r, self.d)
+        except (PETSc.Error, ImportError) as e:
+            raise translate(e, "solve failed") from None
+        self.passes += 1
+        self.iterations += ksp.getIterationNumber()
+        self.history.append(np.array(ksp.getConvergenceHistory()))
+        self.reason = reason_name(ksp)
+
+    def _judge(self) -> None:
+        """See where x stands. Collective.
+
+        Raises:
+            SolveError: it is not finite.
+        """
+        self.check = self.system.check(self.x, self.r)
+        self.missing = self.check.excess(self.goal, self.field_goal)
+        if not math.isfinite(self.missing):
+            where = broken_level(self.ksp.getPC())
+            raise SolveError(
+                f"the solution is not finite after {self.iterations} iterations ({self.reason})"
+                + (f"; {where}" if where else "")
+            )
+        if self.missing > 1.0:
+            self.check = self.system.check(self.x, self.r, exactly=True)
+            self.missing = self.check.excess(self.goal, self.field_goal)
+
+    def destroy(self) -> None:
+        """Collective."""
+        for vector in (self.x, self.r, self.d):
+            vector.destroy()
 
 
 class _Parts:
@@ -381,15 +524,11 @@ class _Retry:
         self.prefix = f"{solver.prefix}retry_"
         file = database.fitting_file(name, solver.layout.fields)
         self._inserted = database.insert_all(database.parse(file), self.prefix)
-        self._matrix = solver._make_matrix(mat_type(self.prefix))
-        self._own = self._matrix is not solver.system.J and len(solver.layout.fields) > 1
-        self.ksp = solver._make_ksp(self._matrix, self.prefix)
+        self.ksp = solver._make_ksp(self.prefix)
 
     def destroy(self) -> None:
         """Collective."""
         self.ksp.destroy()
-        if self._own:
-            self._matrix.destroy()
         database.delete_all(self._inserted)
 
 
@@ -402,18 +541,6 @@ def _set_up(ksp: PETSc.KSP) -> None:
             level.setUpOnBlocks()
     except (PETSc.Error, ImportError) as e:
         raise translate(e, "set-up failed") from None
-
-
-def mat_type(prefix: str) -> str:
-    """Value of -petsc_fs_mat_type. Local.
-
-    Raises:
-        UsageError: it has an impossible value.
-    """
-    kind = str(PETSc.Options(prefix).getString("petsc_fs_mat_type", MAT_TYPES[0]))
-    if kind not in MAT_TYPES:
-        raise UsageError(f"-{prefix}petsc_fs_mat_type {kind}: expected {' or '.join(MAT_TYPES)}")
-    return kind
 
 
 def needs_coordinates(prefix: str) -> bool:
@@ -446,4 +573,3 @@ def broken_level(pc: PETSc.PC) -> str:
             hint = f"; if it is MUMPS, raise {prefix}mat_mumps_icntl_14" if kind in ("lu", "cholesky") else ""
             return f"level {prefix} ({kind}) {what}{hint}"
     return ""
-

@@ -25,12 +25,14 @@ Floats = NDArray[np.float64]
 FieldArrays = dict[str, Floats]
 Pair = tuple[str, str]
 
-ROUNDS = 10
+WEAK = 1e-8
+"""Ratio to the median from which a diagonal entry is next to nothing."""
+ROUNDS = 50
 """Rounds of equilibration between fields, of which there are few."""
 
 
 EPS = 2.0**-52
-ROUNDING_UNITS = 20
+ROUNDING_UNITS = 10
 """A residual of so many units of rounding of the terms of its equations cannot be told from zero."""
 
 
@@ -59,14 +61,14 @@ class Check:
         return {f: r / (self.terms[f] or 1.0) for f, r in self.residual.items()}
 
     @property
-    def rounded(self) -> bool:
-        """Whether rounding explains the residual in every field."""
-        return all(e <= ROUNDING_UNITS * EPS for e in self.backward.values())
+    def rounding(self) -> float:
+        """What rounding may leave of the residual, relative to |b|."""
+        return ROUNDING_UNITS * EPS * norm(self.terms) / (norm(self.rhs) or 1.0)
 
     def excess(self, tolerance: float, field_tolerance: float) -> float:
-        """By what factor the tolerances are missed; at most 1 where they are met."""
-        overall = 0.0 if self.rounded else self.relative / tolerance
-        return max(overall, *(e / field_tolerance for e in self.backward.values()))
+        """By what factor the tolerances are missed; at most 1 where they are met, or rounding forbids it."""
+        overall = self.relative / max(tolerance, self.rounding)
+        return max(overall, *(e / max(field_tolerance, ROUNDING_UNITS * EPS) for e in self.backward.values()))
 
 
 def norm(parts: Mapping[str, float]) -> float:
@@ -87,6 +89,7 @@ class System:
         b: right-hand side, numbered as J: on each rank field by field.
         row_scale: per field the exponent of two that its rows are multiplied by.
         rhs_scale: the exponent that the right-hand side, and with it the solution, is multiplied by besides.
+        block_norms: largest row sum of |entries| of each block, as it was given.
         renewals: how often blocks were made anew because their pattern had changed.
     """
 
@@ -106,6 +109,7 @@ class System:
         self.renewals = 0
         self.row_scale = dict.fromkeys(layout.fields, 0)
         self.rhs_scale = 0
+        self.block_norms: dict[Pair, float] = {}
         self._coordinates = coordinates
         self._patterns: dict[Pair, CSR] = {}
         given = Layout.contiguous(layout.comm, layout.dimension, {f: layout.sizes(f)[1] for f in layout.fields})
@@ -141,21 +145,17 @@ class System:
         for name in self.layout.fields:
             self.blocks[name, name].setName(name)
         self._compose(scene)
-        rhs = {f: self.to_layout(f, scene.rhs[f] if scene is not None else None) for f in self.layout.fields}
-        self._equilibrate(rhs)
+        self._equilibrate()
         self.J = nest.nest_of(self.layout.fields, self.blocks, self.layout.comm)
         if old is not None:
             old.destroy()
         if self.b is None:
             self.b = self.J.createVecLeft()
-        self._set_rhs(rhs)
+        self.set_rhs(scene.rhs if scene is not None else None)
 
     def set_rhs(self, rhs: Mapping[str, Floats] | None) -> None:
         """Take a right-hand side, given as in `take`. Collective."""
-        self._set_rhs({f: self.to_layout(f, rhs[f] if rhs else None) for f in self.layout.fields})
-
-    def _set_rhs(self, rhs: FieldArrays) -> None:
-        local = [np.ldexp(rhs[f], self.row_scale[f]) for f in self.layout.fields]
+        local = [np.ldexp(self.to_layout(f, rhs[f] if rhs else None), self.row_scale[f]) for f in self.layout.fields]
         largest = self.layout.comm.allreduce(max(float(np.abs(v).max(initial=0.0)) for v in local), MPI.MAX)
         self.rhs_scale = -math.frexp(largest)[1] if largest else 0
         self.b.setArray(np.ldexp(np.concatenate(local), self.rhs_scale))
@@ -174,7 +174,7 @@ class System:
                     f"block ({r}, {c}): {block.data.size} entries on a rank; "
                     "use more ranks, or a PETSc with 64-bit indices"
                 )
-        if hasattr(scene, 'check_rows'):
+        if hasattr(scene, "check_rows"):
             scene.check_rows()
 
     def _bsize(self, r: str, c: str) -> tuple[int, int]:
@@ -196,25 +196,29 @@ class System:
                 block = csr_rows(block, 0, self._shares[rc[0]][1] - self._shares[rc[0]][0])
             elif scene.rows is None:
                 block = csr_rows(block, *self._shares[rc[0]])
-            self.blocks[rc] = self._from_rows(*rc, block)
-            del block  # before the next one is made
+            given = [block]
+            del block
+            self.blocks[rc] = self._from_rows(*rc, given, keep=not release)
 
-    def _from_rows(self, r: str, c: str, block: CSR) -> PETSc.Mat:
-        comm = self.layout.comm
+    def _from_rows(self, r: str, c: str, given: list[CSR], *, keep: bool) -> PETSc.Mat:
+        """A block from this rank's share of its rows, which is taken out of `given`."""
+        comm, block = self.layout.comm, given.pop()
         sizes = tuple((self._shares[f][1] - self._shares[f][0], self.layout.sizes(f)[1]) for f in (r, c))
         csr = tuple(part.astype(PETSc.IntType, copy=False) for part in block[:2]) + (block.data,)
         if comm.size == 1:
-            given = PETSc.Mat().createAIJWithArrays(sizes, csr, comm=comm)  # a copy of which is faster than insertion
+            matrix = PETSc.Mat().createAIJWithArrays(sizes, csr, comm=comm)  # in these very arrays
         else:
-            given = PETSc.Mat().createAIJ(sizes, csr=csr, comm=comm)
-            if not self._moved:
-                given.setBlockSizes(*self._bsize(r, c))
-                return given
-        if self._moved:
-            matrix = given.createSubMatrix(self._rows[r].numbers, self._rows[c].numbers)
-        else:
-            matrix = given.duplicate(copy=True)
-        given.destroy()
+            matrix = PETSc.Mat().createAIJ(sizes, csr=csr, comm=comm)
+        del block, csr
+        if self._moved or (keep and comm.size == 1):
+            shared = matrix
+            if self._moved:
+                matrix = shared.createSubMatrix(self._rows[r].numbers, self._rows[c].numbers)
+                for kept in (b"SubMatrix", b"ISAllGather"):  # copies for another call of the same kind
+                    nest.call("PetscObjectCompose", matrix, kept, None)
+            else:
+                matrix = shared.duplicate(copy=True)
+            shared.destroy()
         matrix.setBlockSizes(*self._bsize(r, c))
         return matrix
 
@@ -308,16 +312,10 @@ class System:
 
     # Scales
 
-    def _equilibrate(self, rhs: FieldArrays) -> None:
+    def _equilibrate(self) -> None:
         """Multiply the rows of each field by a power of two, so that blocks are alike in size whatever the units."""
-        sizes = {rc: block.norm(PETSc.NormType.INFINITY) for rc, block in self.blocks.items()}
-        exponents = row_exponents(sizes)
-        largest = np.array([float(np.abs(rhs[f]).max(initial=0.0)) for f in self.layout.fields])
-        self.layout.comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
-        logs = {f: math.log2(v) for f, v in zip(self.layout.fields, largest, strict=True) if v > 0}
-        if logs:
-            b, Rb = max(logs.values()), max(v + exponents[f] for f, v in logs.items())
-            exponents = {f: max(0, round(e + b - Rb)) for f, e in exponents.items()}
+        self.block_norms = {rc: block.norm(PETSc.NormType.INFINITY) for rc, block in self.blocks.items()}
+        exponents = row_exponents(self.block_norms)
         for (r, _), block in self.blocks.items():
             if exponents[r]:
                 block.scale(2.0 ** exponents[r])
@@ -360,6 +358,22 @@ class System:
             r.setArray(np.concatenate([*residual.values()]))
             found = ({f: np.ldexp(v, -self.row_scale[f]) for f, v in part.items()} for part in (residual, terms, rhs))
             return Check(*(self.norms(part) for part in found))
+
+    def has_weak_pivots(self) -> bool:
+        """Whether preconditioners divide by an entry of J_44 that is next to nothing beside the others. Collective."""
+        if "intf_flow" not in self.layout.fields:
+            return False
+        diagonal = self.blocks["intf_flow", "intf_flow"].getDiagonal()
+        everywhere = np.abs(np.concatenate(self.layout.comm.allgather(diagonal.getArray())))
+        diagonal.destroy()
+        return bool(everywhere.min() < WEAK * np.median(everywhere))
+
+    def least_sizes(self, check: Check, tolerance: float) -> dict[str, float]:
+        """Per field the size below which it changes no equation by more than a tolerance of its terms. Local."""
+        limits = {
+            f: [check.terms[r] / n for (r, c), n in self.block_norms.items() if c == f and n] for f in check.terms
+        }
+        return {f: tolerance * min(found, default=0.0) for f, found in limits.items()}
 
     def norms(self, arrays: Mapping[str, Floats]) -> dict[str, float]:
         """Euclidean norm of each field over all ranks. Collective."""
