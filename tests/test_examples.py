@@ -21,11 +21,18 @@ from pathlib import Path
 import petsc_fs
 from petsc_fs.io import hdf5
 from petsc_fs.solver import Solver
-solver = Solver(hdf5.read(Path(petsc_fs.__path__[0]) / "scenes" / "{scene}.h5"))
-result = solver.solve()
-assert result.converged
+scene = hdf5.read(Path(petsc_fs.__path__[0]) / "scenes" / "{scene}.h5")
+solver = Solver(scene)
+system = solver.system
+for (row, _), block in system.blocks.items():  # back to the system as it was given
+    block.scale(2.0 ** -system.row_scale[row])
+system.blocks["mass", "mass"].query("fixed_stress_base").scale(2.0 ** -system.row_scale["mass"])
+system.row_scale = dict.fromkeys(system.row_scale, 0)
+system.set_rhs(scene.rhs)
+x = system.b.duplicate()
+solver.ksp.solve(system.b, x)
 if solver.layout.comm.rank == 0:
-    print(f"{{result.iterations}} iterations, true relative residual {{result.true_relative_residual:e}}")
+    print(solver.ksp.getIterationNumber())
 """
 
 
@@ -55,10 +62,9 @@ def solves(text: str) -> list[tuple[int, float, float]]:
 
 @functools.cache
 def reference(scene: str, ranks: int) -> int:
-    """Iterations of Solver, with rows dealt out in order as the examples deal them."""
+    """Iterations of the KSP of Solver on the system as it is, with rows dealt out in order as the examples do."""
     program = REFERENCE.format(scene=scene)
-    command = f"mpiexec -n {ranks} python -c '{program}' -petsc_fs_partition contiguous"
-    return solves(run(command, ROOT)[0])[0][0]
+    return int(run(f"mpiexec -n {ranks} python -c '{program}' -petsc_fs_partition contiguous {FAST}", ROOT)[0])
 
 
 def example(name: str, tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -78,7 +78,7 @@ class BasePC(ABC):
     def setUp(self, pc: PETSc.PC) -> None:
         """Take a new matrix. Collective."""
         self.update(pc)
-        PETSc.garbage_cleanup(pc.comm)  # on several ranks petsc4py keeps what Python drops, and C would never ask for it
+        PETSc.garbage_cleanup(pc.comm)  # on several ranks petsc4py keeps what Python drops
 
     @abstractmethod
     def update(self, pc: PETSc.PC) -> None:
