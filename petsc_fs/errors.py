@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -38,24 +36,32 @@ class LayoutError(SceneError):
     """A field whose length, block size or index set does not fit the others."""
 
 
-@contextmanager
-def together(comm: MPI.Intracomm) -> Iterator[None]:
+class together:
     """Run a block without communication so that an error on one rank is raised on all.
 
-    Collective on `comm`. The block itself must not communicate. If any rank raises, every rank
-    raises the error of the lowest such rank (its own error stays attached as the cause).
+    Collective on `comm`, as `with together(comm):`. The block itself must not communicate. If any rank raises, every
+    rank raises the error of the lowest such rank (its own error stays attached as the cause). What is no `Exception`,
+    an interrupt for example, passes without the others.
+
+    A class and no generator: from Python 3.12 on, the frame of a generator and the error thrown into it hold each
+    other, and with them the caller's PETSc objects, beyond PetscFinalize on some ranks.
     """
-    error: Exception | None = None
-    try:
-        yield
-    except Exception as e:
-        error = e
-    first = next((e for e in comm.allgather(error and portable(error)) if e is not None), None)
-    try:
-        if first is not None:
-            raise first from error
-    finally:  # or error and frames hold each other, and with them PETSc's objects, beyond PetscFinalize on some ranks
-        del first, error
+
+    def __init__(self, comm: MPI.Intracomm) -> None:
+        self.comm = comm
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: object) -> None:
+        if error is not None and not isinstance(error, Exception):
+            return
+        first = next((e for e in self.comm.allgather(error and portable(error)) if e is not None), None)
+        try:
+            if first is not None:
+                raise first from error
+        finally:  # or this frame and the errors hold each other
+            del first, error, trace
 
 
 def portable(error: BaseException) -> Exception:

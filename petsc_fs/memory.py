@@ -94,8 +94,9 @@ class Phases:
         self.separate = reset_peak()
 
     def end(self, phase: str) -> None:
-        """The phase that began with the end of the last one is over. Local."""
-        self.peaks[phase], self.helds[phase] = peak(), held()
+        """The phase that began with the end of the last one is over; it may have several parts. Local."""
+        self.peaks[phase] = max(peak(), self.peaks.get(phase, 0))
+        self.helds[phase] = held()
         self.separate = reset_peak() and self.separate
 
     def report(self, comm: MPI.Intracomm) -> dict[str, Any]:

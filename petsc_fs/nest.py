@@ -313,7 +313,19 @@ def multiply(A: PETSc.Mat, x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def multiply_absolute(A: PETSc.Mat, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """|A| |x|, entry by entry, from a copy of an AIJ. Collective."""
+    """|A| |x|, entry by entry. Collective."""
+    M = magnitudes(A)
+    product = multiply(M, np.abs(x))
+    M.destroy()
+    return product
+
+
+def magnitudes(A: PETSc.Mat) -> PETSc.Mat:
+    """A copy of an AIJ, or of a MatNest of such, with the magnitudes of all entries. Collective."""
+    if A.getType() == "nest":
+        rows, columns = (range(n) for n in A.getNestSize())
+        grid = [[A.getNestSubMatrix(i, j) for j in columns] for i in rows]
+        return PETSc.Mat().createNest([[magnitudes(B) if B else None for B in row] for row in grid], comm=A.comm)
     copy = A.duplicate(copy=True)
     parts = [copy]
     if copy.getType().startswith("mpi"):
@@ -328,9 +340,7 @@ def multiply_absolute(A: PETSc.Mat, x: NDArray[np.float64]) -> NDArray[np.float6
             values = np.ctypeslib.as_array(address, shape=(entries,))
             np.abs(values, out=values)
         call("MatSeqAIJRestoreArray", part, ctypes.byref(address))
-    product = multiply(copy, np.abs(x))
-    copy.destroy()
-    return product
+    return copy
 
 
 def borrowed(owner: PETSc.Object, handle: ctypes.c_void_p) -> Any:

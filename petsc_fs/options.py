@@ -1,4 +1,4 @@
-"""Options files and the options database: files found, checked and described; unused options named."""
+"""Options files and PETSc's options database: which file for which fields, files checked, unused options named."""
 
 from __future__ import annotations
 
@@ -7,49 +7,58 @@ import ctypes
 import difflib
 import fnmatch
 import itertools
+import math
 import os
 import re
-import sys
+import signal
 import sysconfig
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from petsc_fs.errors import UsageError
-from petsc_fs.fields import FIELD_NAMES, in_order
+from petsc_fs.errors import UsageError, together
+from petsc_fs.fields import FIELD_NAMES, MECHANICS, in_order
 
 if TYPE_CHECKING:
-    from petsc_fs.tree import LeftOut
+    from mpi4py import MPI
+
+    from petsc_fs.scene import Scene
 
 Number = TypeVar("Number", int, float)
-
-OWN = (
-    "petsc_fs_mat_type",
-    "petsc_fs_restarts",
-    "petsc_fs_true_rtol",
-    "petsc_fs_error_factor",
-    "petsc_fs_scaling",
-    "petsc_fs_fallback",
-    "petsc_fs_regularize",
-    "petsc_fs_stagnation_window",
-    "petsc_fs_stagnation_ratio",
-    "petsc_fs_reuse",
-    "petsc_fs_reuse_changed",
-    "petsc_fs_reuse_growth",
-    "petsc_fs_reuse_age",
-)
-"""Options of `petsc_fs.solver.Solver`."""
+Options = dict[str, str | None]
+"""Values by full name, without the dash; None where an option has no value."""
 
 SPLIT = r"(?<!pc_)fieldsplit_(?:intf_force|intf_flow|[A-Za-z]+|\d+)_"
 """The prefix of one split in an option name, but not PCFIELDSPLIT's own `pc_fieldsplit_0_fields`."""
-
-AT_THE_END = ("options_left", "options_view", "get_total_flops", "objects_view", "mpidump")
-"""Options that PETSc asks for only in PetscFinalize."""
-
+AT_THE_END = ("options_left", "options_view", "get_total_flops", "objects_view", "mpidump", "citations", "skip_petscrc")
+"""Options that PETSc asks for only in PetscFinalize, or before anybody can see it."""
 ALLOW_UNUSED = "petsc_fs_allow_unused"
 """Option with patterns, such as `my_*`, of options that may do nothing, separated by commas."""
+OWN = (
+    *(f"petsc_fs_{name}" for name in ("partition", "ordering", "retry", "on_failure", "forcing")),
+    *(ALLOW_UNUSED, "qr_side", "ksp_monitor", "ksp_monitor_true_residual", "ksp_view", "ksp_converged_reason"),
+)
+"""Options that somebody may mean at the outermost level although no shipped file has them."""
+AT_ANY_LEVEL = (
+    *(f"ksp_{name}" for name in ("type", "rtol", "atol", "max_it", "gmres_restart")),
+    *(f"pc_{name}" for name in ("type", "fieldsplit_type", "hypre_type", "hypre_boomeramg_strong_threshold")),
+    *("fs_type", "fs_damping"),
+)
+"""The same at any level."""
+NUMBERS: dict[str, tuple[float, float, bool]] = {
+    "ksp_rtol": (0.0, 1.0, False),
+    "ksp_atol": (0.0, math.inf, False),
+    "ksp_divtol": (0.0, math.inf, False),
+    "ksp_max_it": (0, math.inf, True),
+    "ksp_gmres_restart": (1, math.inf, True),
+}
+"""Least value, value that is too large, and whether it is a whole number, of options that end in these names."""
+TAKE_FILES = ("options_file", "petsc_fs_retry", "petsc_fs_retry_file")
+
+
+# Files
 
 
 def shipped_folder() -> Path:
@@ -65,17 +74,15 @@ def find_options_file(name: str) -> Path:
         UsageError: there is none, or it cannot be read.
     """
     path = Path(name)
-    if not path.exists() and (shipped_folder() / path.name).exists() and path.parent in (Path(), Path("options")):
+    here = path.parent in (Path(), Path("options"))
+    if here and not os.path.exists(path) and os.path.exists(shipped_folder() / path.name):
         path = shipped_folder() / path.name
-    if not path.is_file():
+    if not os.path.isfile(path):
         names = ", ".join(sorted(p.name for p in shipped_folder().glob("*.opts")))
         raise UsageError(f"options file {name}: no such file; shipped are {names}")
     if not os.access(path, os.R_OK):
         raise UsageError(f"options file {name}: no permission to read it")
     return path
-
-
-_numbers = itertools.count()
 
 
 @dataclass(frozen=True)
@@ -86,7 +93,7 @@ class OptionsFile:
         path: of the file.
         purpose: first line.
         fields: fields that a scene must have, no more and no fewer; empty if any will do.
-        default: whether `solve` takes it when none is named.
+        default: whether `choose` takes it for these fields.
         not_for: bundled scenes it is known to fail on.
     """
 
@@ -103,7 +110,7 @@ class OptionsFile:
 
 def read_header(path: Path) -> OptionsFile:
     """Header of an options file: comment lines `# fields:`, `# default: yes` and `# not_for:`."""
-    comments = [line[1:].strip() for line in _text(path).splitlines() if line.startswith("#")]
+    comments = [line[1:].strip() for line in _text(path).split("\n") if line.startswith("#")]
     entries = {m[1]: m[2] for m in (re.match(r"(\w+): *(.*)", c) for c in comments) if m}
     fields = in_order(f for f in re.findall(r"\w+", entries.get("fields", "")) if f in FIELD_NAMES)
     return OptionsFile(
@@ -115,51 +122,313 @@ def read_header(path: Path) -> OptionsFile:
     )
 
 
+def fitting_file(name: str, fields: Iterable[str]) -> Path:
+    """An options file, see `find_options_file`, that is for scenes with these fields.
+
+    Raises:
+        UsageError: there is no such file, or it is for others.
+    """
+    header = read_header(find_options_file(name))
+    if not header.fits(fields):
+        raise UsageError(
+            f"{header.path.name} is for scenes with the fields {', '.join(header.fields)}; "
+            f"this one has {', '.join(in_order(fields))}"
+        )
+    return header.path
+
+
 def shipped() -> list[OptionsFile]:
     """All shipped options files, by name."""
     return [read_header(path) for path in sorted(shipped_folder().glob("*.opts"))]
 
 
-def default_for(fields: Iterable[str]) -> Path:
-    """The shipped options file for scenes with these fields.
+def is_option(word: str) -> bool:
+    """Whether PETSc takes a word for an option, and not for a value such as -1e-3."""
+    try:
+        float(word)
+    except ValueError:
+        return re.match("--?[A-Za-z]", word) is not None
+    return False
+
+
+def parse(path: Path) -> Options:
+    """Options of a file, and of those that it names by -options_file in their place.
+
+    A file may come from any editor: with a byte order mark, with any line ends.
 
     Raises:
-        UsageError: there is none.
+        UsageError: it cannot be read, or PETSc would stop at a line or understand something else.
     """
-    names = in_order(fields)
-    for file in shipped():
-        if file.default and file.fits(names):
-            return file.path
-    raise UsageError(f"no default solver for the fields {', '.join(names)}: name one with -options_file")
+    return _parse(path.absolute(), ())
 
 
-def parse(path: Path) -> dict[str, str | None]:
-    """Options of a file by full name, without the dash; None where an option has no value.
+def _parse(path: Path, above: tuple[Path, ...]) -> Options:
+    if path.resolve() in above:
+        raise UsageError(f"options file {path} includes itself")
+    lines = []
+    for number, line in enumerate(_text(path).split("\n"), start=1):
+        words = re.findall(r"""["'][^"']*["']|\S+""", line.split("#")[0], re.ASCII)
+        if words and (words[0].startswith("--") or not is_option(words[0])):
+            raise UsageError(f"{path}:{number}: {words[0]!r} is not an option; options start with '-'")
+        lines.append((f"{path}:{number}: ", [word.strip("\"'") for word in words]))
+    return _collect(lines, f"{path}: ", (*above, path.resolve()))
 
-    Raises:
-        UsageError: PETSc would stop at a line (it is no option, or prefixes do not pair up).
-    """
-    found: dict[str, str | None] = {}
+
+def _collect(lines: Iterable[tuple[str, Sequence[str]]], name: str, above: tuple[Path, ...] = ()) -> Options:
+    """Options in lines of words, each with where it stands."""
+    found: Options = {}
     prefixes = [""]
-    for number, raw in enumerate(_text(path).splitlines(), start=1):
-        name, *values = raw.split("#")[0].split() or [""]
-        if not name:
-            continue
-        if not re.match(r"-[A-Za-z_]", name):
-            raise UsageError(f"{path}:{number}: {name!r} is not an option; options start with '-'")
-        if name == "-prefix_push":
-            if not values:
-                raise UsageError(f"{path}:{number}: -prefix_push without a prefix")
-            prefixes.append(prefixes[-1] + values[0])
-        elif name == "-prefix_pop":
-            prefixes.pop()
-            if not prefixes:
-                raise UsageError(f"{path}:{number}: -prefix_pop without a -prefix_push before it")
-        else:
-            found[prefixes[-1] + name[1:]] = " ".join(values) or None
+    for where, line in lines:
+        words, before = list(line), ""
+        while words:
+            word = words.pop(0)
+            if not is_option(word):
+                raise UsageError(f"{where}{word!r} belongs to no option: -{before} has its value already")
+            value = words.pop(0) if words and not is_option(words[0]) else None
+            option = before = word.lstrip("-")
+            _refuse_unclear(option, value, where)
+            if option == "prefix_push":
+                prefixes.append(f"{prefixes[-1]}{value}")
+            elif option == "prefix_pop":
+                prefixes.pop()
+                if not prefixes:
+                    raise UsageError(f"{where}-prefix_pop without a -prefix_push before it")
+            elif option == "options_file":
+                try:
+                    inner = _parse(find_options_file(f"{value}"), above)
+                except UsageError as e:
+                    raise UsageError(f"{where}{e}") from e
+                found |= _put(prefixes[-1], inner)
+            else:
+                found[prefixes[-1] + option] = value
     if len(prefixes) > 1:
-        raise UsageError(f"{path}: {len(prefixes) - 1} -prefix_push without a -prefix_pop")
+        raise UsageError(f"{name}{len(prefixes) - 1} -prefix_push without a -prefix_pop")
     return found
+
+
+def _refuse_unclear(option: str, value: str | None, where: str) -> None:
+    """Raise a UsageError if PETSc would take an option for something else than is meant."""
+    if "=" in option:
+        raise UsageError(f"{where}-{option}: a space, no '=', goes between an option and its value")
+    strange = next((c for c in f"{option}{value}" if not c.isprintable()), None)
+    if strange is not None and option != "options_file":
+        raise UsageError(f"{where}-{option}: PETSc cannot take the character U+{ord(strange):04X}")
+    if option in ("prefix_push", "options_file") and not value:
+        raise UsageError(
+            f"{where}-{option} without {'a prefix' if option == 'prefix_push' else 'the name of the file'}"
+        )
+
+
+def _text(path: Path) -> str:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as e:
+        raise UsageError(f"options file {path}: not readable as text: {e}") from e
+    if "\0" in text:
+        raise UsageError(f"options file {path}: not readable as text: it has a NUL character")
+    return text
+
+
+def check(values: Mapping[str, str | None]) -> None:
+    """Look at the numbers that decide when a solver stops: PETSc takes nan, and where none is given its default.
+
+    Raises:
+        UsageError: one is missing or impossible.
+    """
+    for name, value in values.items():
+        known = next((n for n in NUMBERS if re.search(f"(^|_){n}$", name)), None)
+        if known is None or (value or "").upper().removeprefix("PETSC_") in ("DEFAULT", "DECIDE"):
+            continue
+        least, end, whole = NUMBERS[known]
+        try:
+            found = int(value or "") if whole else float(value or "")
+        except ValueError:
+            found = math.nan
+        if not least <= found < end:
+            kind = "a whole number" if whole else "a number"
+            size = f"from {least:g} on" if end == math.inf else f"from {least:g} to below {end:g}"
+            raise UsageError(f"-{name} {value or 'without a value'}: expected {kind} {size}")
+
+
+# Which file for which fields
+
+FLOW = ("intf_flow", "mass")
+CANONICAL = "contact_poromechanics_fast.opts"
+"""Options file with all levels."""
+WITHOUT_HYPRE = "contact_poromechanics_gamg.opts"
+"""The same for a PETSc that lacks hypre."""
+REST = "qr_fieldsplit_1_"
+STRESS = tuple(f"{REST}fieldsplit_1_{name}" for name in ("fs_type", "fs_damping", "pc_python_type"))
+LEFT_OUT: dict[str, tuple[str, ...]] = {
+    "no contact: Q_r and the first Schur level left out": ("qr_side", "qr_mechanics_", "qr_fieldsplit_contact_"),
+    "no mechanics: the second Schur level with fixed stress left out": (f"{REST}fieldsplit_mechanics_", *STRESS),
+    "no flow: the second and third Schur levels left out": (f"{REST}fieldsplit_1_",),
+    "mechanics and flow decoupled: fixed stress left out": STRESS,
+    "mechanics and flow act one way only: fixed stress left out": STRESS,
+    "no interface flow: the third Schur level left out": (f"{REST}fieldsplit_1_fs_fieldsplit_intf_flow_",),
+}
+"""What a scene may make superfluous of the canonical solver, with the beginnings of its options there."""
+NO_CONTACT, NO_MECHANICS, NO_FLOW, DECOUPLED, ONE_WAY, NO_INTERFACE_FLOW = LEFT_OUT
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What decides which levels a scene needs; the same on all ranks.
+
+    Contact always has its transformation Q_r: fracture cells open and close, and where J_11 is invertible multigrid
+    still needs it.
+
+    Attributes:
+        fields: those with unknowns.
+        flow_moves_rock: pressure acts on the mechanics.
+        rock_moves_flow: displacements act on the flow.
+    """
+
+    fields: tuple[str, ...]
+    flow_moves_rock: bool
+    rock_moves_flow: bool
+
+    @classmethod
+    def of(cls, scene: Scene, comm: MPI.Intracomm) -> Facts:
+        """Look at a scene, or at the rows of it that each rank has. Collective."""
+
+        def acts(rows: tuple[str, ...], columns: tuple[str, ...]) -> bool:
+            return any(scene.blocks[rc].data.any() for rc in scene.blocks if rc[0] in rows and rc[1] in columns)
+
+        found = comm.allgather((acts(MECHANICS, FLOW), acts(FLOW, MECHANICS)))
+        names = tuple(f for f in scene.fields if scene.sizes[f])
+        return cls(names, any(moves for moves, _ in found), any(moves for _, moves in found))
+
+    def or_either(self, other: Facts) -> Facts:
+        """What is true here or there, so that a level that was needed once is kept."""
+        moves_rock, moves_flow = self.flow_moves_rock, self.rock_moves_flow
+        return Facts(self.fields, moves_rock or other.flow_moves_rock, moves_flow or other.rock_moves_flow)
+
+    def left_out(self) -> Iterator[str]:
+        """What of the canonical solver such a scene does not need, from the outermost level inwards."""
+        mechanics, flow = (any(f in self.fields for f in part) for part in (MECHANICS, FLOW))
+        if "contact" not in self.fields:
+            yield NO_CONTACT
+        if not mechanics:
+            yield NO_MECHANICS
+        if not flow:
+            yield NO_FLOW
+        elif mechanics and not (self.flow_moves_rock or self.rock_moves_flow):
+            yield DECOUPLED
+        elif mechanics and not (self.flow_moves_rock and self.rock_moves_flow):
+            yield ONE_WAY
+        if flow and "intf_flow" not in self.fields:
+            yield NO_INTERFACE_FLOW
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The options of the smallest solver for a scene.
+
+    Attributes:
+        values: by full name, in the order of elimination.
+        file: shipped file that they are those of; None if they are cut from the canonical one.
+        left_out: what of the canonical solver is not there, a line each.
+    """
+
+    values: Options = field(default_factory=dict)
+    file: Path | None = None
+    left_out: tuple[str, ...] = ()
+
+    def text(self, title: str) -> str:
+        """An options file, with a comment for each part left out."""
+        lines = [f"-{name}" if value is None else f"-{name} {value}" for name, value in self.values.items()]
+        body = "\n".join(lines) + "\n" if self.file is None else _text(self.file)
+        return "".join(f"# {line}\n" for line in (title, *self.left_out)) + "#\n" + body
+
+
+def choose(facts: Facts) -> Choice:
+    """The shipped file for a usual set of fields; for others, what is left of the canonical one. Local.
+
+    Raises:
+        UsageError: the scene has no unknowns.
+    """
+    from petsc4py import PETSc
+
+    if not facts.fields:
+        raise UsageError("the scene has no unknowns, there is nothing to solve")
+    canonical = shipped_folder() / CANONICAL
+    files = [file.path for file in shipped() if file.default and file.fields == facts.fields]
+    if not PETSc.Sys.hasExternalPackage("hypre"):
+        canonical = shipped_folder() / WITHOUT_HYPRE
+        files = [canonical] if facts.fields == FIELD_NAMES else []
+    left_out = tuple(facts.left_out())
+    if files and not {DECOUPLED, ONE_WAY} & set(left_out):
+        return Choice(parse(files[0]), files[0], left_out)
+    return Choice(cut(parse(canonical), facts), None, left_out)
+
+
+def cut(canonical: Mapping[str, str | None], facts: Facts) -> Options:
+    """What is left of the canonical options where levels have nothing to do: those inside move up.
+
+    Args:
+        canonical: options of the file with all levels.
+        facts: about the scene.
+    """
+    level_1 = _under(canonical, "qr_")
+    level_2 = _under(level_1, "fieldsplit_1_")
+    stress = _under(level_2, "fieldsplit_1_")
+    mechanics, flow = (tuple(f for f in part if f in facts.fields) for part in (MECHANICS, FLOW))
+    outer = {name: value for name, value in canonical.items() if name.startswith("ksp_")}
+    transform = {"contact", "intf_force"} <= set(facts.fields)
+
+    inner = _under(stress, "fs_")
+    node = inner if len(flow) == len(FLOW) else _under(inner, f"fieldsplit_{flow[0]}_") if flow else {}
+    node = {name: value for name, value in node.items() if name not in ("type", "damping", "ksp_type")}
+    if mechanics and "mass" in flow and facts.flow_moves_rock and facts.rock_moves_flow:
+        own = {k: v for k, v in stress.items() if not k.startswith("fs_") or k in ("fs_type", "fs_damping")}
+        node = own | _put("fs_", node)
+    members = list(flow)
+    if mechanics:
+        leaf = _under(level_2, "fieldsplit_mechanics_")
+        names = ["mechanics"] if transform else list(mechanics)
+        if len(names) > 1 and leaf.get("pc_type") != "python":
+            leaf = {"pc_type": "python", "pc_python_type": "petsc_fs.pc.Assembled", **_put("assembled_", leaf)}
+        exact = not (facts.flow_moves_rock or facts.rock_moves_flow)
+        node = _split(level_2, names, leaf, node, members, additive=exact) if members else leaf
+        members = [*names, *members]
+    if "contact" in facts.fields:
+        leaf = _under(level_1, "fieldsplit_contact_")
+        node = _split(level_1, ["contact"], leaf, node, members) if members else leaf
+    node.pop("ksp_type", None)
+    if transform:
+        node = {k: v for k, v in canonical.items() if k.startswith(("pc_", "qr_side", "qr_mech"))} | _put("qr_", node)
+    return outer | node
+
+
+def _split(
+    level: Options, first: list[str], leaf: Options, rest: Options, members: list[str], *, additive: bool = False
+) -> Options:
+    """A level that takes the first fields apart from the others, block-diagonal where that is exact."""
+    own = {name: value for name, value in level.items() if name.startswith("pc_")}
+    if additive:
+        own = {name: value for name, value in own.items() if not name.startswith("pc_fieldsplit_schur")}
+        own["pc_fieldsplit_type"] = "additive"
+    parts = (first, members)
+    numbers = [str(i) for i in range(len(first) + len(members))]
+    for k, chosen in enumerate((numbers[: len(first)], numbers[len(first) :])):
+        own[f"pc_fieldsplit_{k}_fields"] = ",".join(chosen)
+    names = [part[0] if len(part) == 1 else str(k) for k, part in enumerate(parts)]
+    for split, node in zip(names, (leaf, rest), strict=True):
+        own |= _put(f"fieldsplit_{split}_", {"ksp_type": "preonly", **node})
+    return own
+
+
+def _under(options: Mapping[str, str | None], prefix: str) -> Options:
+    """Options with a prefix, without it."""
+    return {name.removeprefix(prefix): value for name, value in options.items() if name.startswith(prefix)}
+
+
+def _put(prefix: str, options: Options) -> Options:
+    return {prefix + name: value for name, value in options.items()}
+
+
+# PETSc's database
 
 
 def insert(path: Path, prefix: str = "") -> None:
@@ -188,6 +457,14 @@ def insert_all(values: Mapping[str, str | None], prefix: str = "") -> tuple[str,
     return new
 
 
+def database() -> Options:
+    """The options in PETSc's database, but those that this package put there for its own sake. Local."""
+    from petsc4py import PETSc
+
+    found: Options = {**PETSc.Options().getAll()}
+    return {k: v for k, v in found.items() if k not in ("options_left", "skip_petscrc")}
+
+
 def delete_all(names: Iterable[str]) -> None:
     """Take options out of PETSc's database. Local."""
     from petsc4py import PETSc
@@ -212,35 +489,6 @@ def inserted(values: Path | Mapping[str, str | None], prefix: str = "") -> Itera
         yield
     finally:
         delete_all(new)
-
-
-@contextlib.contextmanager
-def replaced(values: Mapping[str, str | None]) -> Iterator[None]:
-    """Have options in PETSc's database within a block, in place of those that are set there. Local.
-
-    What was there before comes back, with its mark of having been asked for.
-    """
-    from petsc4py import PETSc
-
-    database = PETSc.Options()
-    before = database.getAll()
-    for name, value in values.items():
-        database.setValue(name, value)
-    try:
-        yield
-    finally:
-        for name in values:
-            if name in before:
-                database.setValue(name, before[name])
-            else:
-                database.delValue(name)
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as e:
-        raise UsageError(f"options file {path}: not readable as text: {e}") from e
 
 
 def number(name: str, default: Number, prefix: str = "") -> Number:
@@ -276,67 +524,6 @@ def unused() -> list[str]:
     return sorted(found)
 
 
-def known_names() -> set[str]:
-    """Names of all options of the KSPs and PCs that the database chooses a type for. Local.
-
-    They are as PETSc's own help lists them, which is caught on its way to standard output. Each KSP is
-    made for this purpose, under a short prefix: PETSc explains the options of a prefix only once, even
-    where nobody listened, and PETSc 3.18 overruns a buffer where a prefix has more than 64 characters.
-    """
-    from petsc4py import PETSc
-
-    idle = set(unused())
-    chosen = {name: value for name, value in PETSc.Options().getAll().items() if name not in idle}
-    types = {name: value for name, value in chosen.items() if name.endswith("_type") and value != "python"}
-    found = set(chosen)
-    for prefix in {m[1] for name in chosen if (m := re.fullmatch("(|.*_)(ksp|pc)_type", name))}:
-        below = {name.removeprefix(prefix): value for name, value in types.items() if name.startswith(prefix)}
-        found.update(prefix + name for name in _explain(below))
-    return found
-
-
-def _explain(types: Mapping[str, str]) -> set[str]:
-    """Options of a KSP and its PC of the given types, by PETSc's help."""
-    from petsc4py import PETSc
-
-    prefix = f"h{next(_numbers)}_"
-    database = PETSc.Options()
-    sys.stdout.flush()
-    saved = os.dup(1)
-    ksp = PETSc.KSP().create(PETSc.COMM_SELF)
-    ksp.setOptionsPrefix(prefix)
-    for name, value in types.items():
-        database.setValue(prefix + name, value)
-    # petsc4py prints by Python where that has another standard output than C
-    with tempfile.TemporaryFile("w+", errors="replace") as capture, contextlib.redirect_stdout(capture):
-        os.dup2(capture.fileno(), 1)
-        database.setValue("help", None)
-        try:
-            ksp.setFromOptions()
-        except PETSc.Error:
-            pass  # an impossible type: what is understood until there will do
-        finally:
-            database.delValue("help")
-            for name in types:
-                database.delValue(prefix + name)
-            sys.stdout.flush()
-            ctypes.CDLL(None).fflush(None)
-            os.dup2(saved, 1)
-            os.close(saved)
-            ksp.destroy()
-        capture.flush()
-        capture.seek(0)
-        text = capture.read()
-    return set(re.findall(rf"^\s*-{prefix}([A-Za-z_]\w*)", text, flags=re.MULTILINE))
-
-
-def closest(name: str, valid: Iterable[str]) -> list[str]:
-    """Up to three valid names that look most like a misspelt one, or that say the same of another split."""
-    others = sorted(set(valid) - {name})
-    tail = re.split(SPLIT, name)[-1]
-    return difflib.get_close_matches(name, others, n=3, cutoff=0.8) or [v for v in others if v.endswith(tail)][:3]
-
-
 def refused(names: Iterable[str]) -> list[str]:
     """Those of some unused options that -petsc_fs_allow_unused does not let pass. Local."""
     from petsc4py import PETSc
@@ -346,59 +533,119 @@ def refused(names: Iterable[str]) -> list[str]:
     return [n for n in names if n not in passed and not any(fnmatch.fnmatchcase(n, p) for p in patterns)]
 
 
+def closest(name: str, valid: Iterable[str]) -> list[str]:
+    """Up to three valid names that look most like a misspelt one, or that say the same of another split."""
+    others = sorted(set(valid) - {name})
+    tail = re.split(SPLIT, name)[-1]
+    return difflib.get_close_matches(name, others, n=3, cutoff=0.8) or [v for v in others if v.endswith(tail)][:3]
+
+
+@cache
+def shipped_names() -> frozenset[str]:
+    """Names of the options in all shipped files."""
+    return frozenset(name for file in shipped() for name in parse(file.path))
+
+
 def explain(
-    useless: Sequence[str],
-    typed: Iterable[str] = (),
-    file: Path | None = None,
-    left_out: Iterable[LeftOut] = (),
+    useless: Sequence[str], typed: Iterable[str] = (), file: Path | None = None, left_out: Iterable[str] = ()
 ) -> str:
-    """Say of each option that did nothing where it came from, why it did nothing, and what it might have meant.
+    """Say of each option that did nothing where it came from, why it did nothing, and what it might have meant. Local.
+
+    It might have meant what is in a shipped file, at a level of the solver in PETSc's database if there is one there.
 
     Args:
         useless: names without the dash.
         typed: names on the command line.
         file: the options file.
-        left_out: levels of the canonical tree that the scene does not need.
+        left_out: see `Choice`.
     """
+    from petsc4py import PETSc
+
     in_file = parse(file) if file is not None else {}
-    valid = (known_names() | set(OWN)) - set(useless)
+    used = {*PETSc.Options().getAll(), *OWN} - set(useless)
+    levels = [{n.removesuffix("pc_type") for n in names if n.endswith("pc_type")} for names in (used, shipped_names())]
+    tails = {n.removeprefix(_level(n, levels[1])) for n in shipped_names()} | set(AT_ANY_LEVEL)
     lines = []
     for name in useless:
-        if name in typed:
-            origin = "the command line"
-        elif name in in_file and file is not None:
-            origin = file.name
-        elif re.search(rf"(^|\s)-{re.escape(name)}(\s|$)", os.environ.get("PETSC_OPTIONS", "")):
-            origin = "PETSC_OPTIONS"
-        else:
-            origin = "a .petscrc file or the program"
-        gone = next((part for part in left_out if name.startswith(part.prefixes)), None) if left_out else None
-        reason = f": its level is not there ({gone})" if gone is not None and gone.prefixes else ""
-        similar = closest(name, valid)
+        origin = "the command line" if name in typed else file.name if file and name in in_file else "PETSC_OPTIONS"
+        reason = next((line for line in left_out if name.startswith(LEFT_OUT.get(line, ()))), "")
+        there = levels[0] or levels[1]
+        valid = used | {_level(name, there) + tail for tail in tails} | {level + "pc_type" for level in there}
+        similar = closest(name, valid - set(useless)) if not reason else []
+        why = f": its level is not there ({reason})" if reason else ""
         hint = f"; did you mean {' or '.join('-' + s for s in similar)}?" if similar else ""
-        lines.append(f"option -{name} from {origin} was not used{reason}{hint}")
+        lines.append(f"option -{name} from {origin} was not used{why}{hint}")
     return lines[0] if len(lines) == 1 else "\n  ".join([f"{len(lines)} options were not used:", *lines])
 
 
-class Choice:  # shim
-    def __init__(self, values=None, left_out=()):
-        self.values, self.left_out = values or {}, left_out
+def _level(name: str, levels: Iterable[str]) -> str:
+    """The longest of some prefixes that a name starts with."""
+    return max((level for level in levels if name.startswith(level)), key=len, default="")
 
 
-def choose(facts):  # shim
-    from petsc_fs.tree import shipped_tree
+@dataclass(frozen=True)
+class Given:
+    """PETSc options of a call, which must not go unused.
 
-    tree = shipped_tree(facts)
-    return Choice(tree.options, tree.left_out)
+    Attributes:
+        typed: names on the command line.
+        values: all of them, those of options files included, in the order in which they count.
+        files: the options files.
+    """
 
+    typed: frozenset[str]
+    values: Options
+    files: tuple[Path, ...]
 
-class Facts:  # shim
-    @staticmethod
-    def of(scene, comm):
-        from petsc_fs.tree import Facts as F
+    @classmethod
+    def of(cls, words: Sequence[str]) -> Given:
+        """Options in words of the command line. Local.
 
-        return F.of(scene, comm)
+        Raises:
+            UsageError: PETSc would stumble over one, or over a line of a file.
+        """
+        values = _collect([("", words)], "the command line: ")
+        check(values)
+        files = [find_options_file(b) for a, b in itertools.pairwise(words) if a.lstrip("-") == "options_file"]
+        return cls(frozenset(word.lstrip("-") for word in words if is_option(word)), values, tuple(files))
 
+    def start(self, *, files: bool = True, petscrc: bool = False) -> None:
+        """Initialise PETSc with these options, if it is not yet; else put them into its database. Collective.
 
-def fitting_file(name, fields):  # shim
-    return find_options_file(name)
+        Args:
+            files: with those of options files.
+            petscrc: read .petscrc of the working directory and of the home; they may load code.
+        """
+        import petsc4py
+
+        before = signal.getsignal(signal.SIGPIPE)
+        values = {name: value for name, value in self.values.items() if files or name in self.typed}
+        words = [word for name, value in values.items() for word in (f"-{name}", value) if word is not None]
+        petsc4py.init(["petsc-fs", *([] if petscrc else ["-skip_petscrc"]), *words])
+        signal.signal(signal.SIGPIPE, before)  # PETSc would end the program where its output is no longer read
+        insert_all(values | {"options_left": "no"})  # newer PETSc would repeat at its end what `judge` says
+        from petsc4py import PETSc
+
+        check(PETSc.Options().getAll())
+
+    def judge(self, comm: MPI.Intracomm, left_out: Iterable[str] = ()) -> str:
+        """Complain about options that nothing on any rank has asked for, after a solve. Collective.
+
+        Returns:
+            a warning about those of PETSC_OPTIONS, which may be meant for other programs; "" if there are none.
+
+        Raises:
+            UsageError: there are others, on all ranks.
+        """
+        idle = set.intersection(*map(set, comm.allgather(unused())))
+        foreign = ""
+        with together(comm):
+            if comm.rank == 0:
+                names = refused(sorted(idle))
+                elsewhere = {w.lstrip("-") for w in os.environ.get("PETSC_OPTIONS", "").split() if is_option(w)}
+                file = self.files[0] if self.files else None
+                if found := [name for name in names if name in self.values]:
+                    raise UsageError(explain(found, self.typed, file, left_out))
+                if found := [name for name in names if name in elsewhere]:
+                    foreign = explain(found, (), None, left_out)
+        return foreign

@@ -15,7 +15,7 @@ from petsc_fs.fields import FIELD, in_order
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from petsc_fs.scene import CSR, Scene
+    from petsc_fs.scene import Scene
 
 Cells = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -352,7 +352,7 @@ def graph_parts(scene: Scene, cells: Mapping[str, int], parts: int, prefix: str 
         raise UsageError(f"-{prefix}petsc_fs_partition ptscotch: needs the whole scene on one rank; use rcb")
     first = dict(zip(cells, np.cumsum([0, *cells.values()])[:-1], strict=True))
     n = sum(cells.values())
-    pairs = []
+    pairs = [np.zeros(0, dtype=np.int64)]
     for (r, c), block in scene.blocks.items():
         rows = first[r] + np.repeat(np.arange(block.indptr.size - 1), np.diff(block.indptr)) // scene.block_size(r)
         columns = first[c] + block.indices.astype(np.int64) // scene.block_size(c)

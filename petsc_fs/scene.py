@@ -2,47 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from petsc_fs.errors import LayoutError, SceneError
+from petsc_fs.csr import (
+    CSR,
+    Floats,
+    Integers,
+    array_of,
+    by_component,
+    check_csr,
+    compressed,
+    csr_rows,
+    cut_rows,
+    diagonal_blocks,
+    gather_rows,
+    increasing,
+    real_numbers,
+    singular_diagonal_blocks,
+    whole_numbers,
+)
+from petsc_fs.errors import LayoutError, SceneError, UsageError
 from petsc_fs.fields import FIELD, FIELD_NAMES, in_order
-from petsc_fs.partition import rows_of
 
-if TYPE_CHECKING:
-    from petsc_fs.cutting import Cutter
-    from petsc_fs.partition import Layout
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.integer[Any]]
-
-ALMOST_SINGULAR = 1e-14
-"""Ratio of least to greatest singular value at which a small matrix counts as singular."""
-
-SLAB = 1 << 20
-"""Number of entries that are sorted or renumbered at a time, which bounds the memory it takes."""
+__all__ = [
+    "CONTACT_STATES", "CSR", "Floats", "Integers", "Material", "Metadata", "Scene", "check_order",
+    "contact_state_counts", "csr_rows", "diagonal_blocks", "gather_rows", "singular_diagonal_blocks",
+]  # fmt: skip
 
 CONTACT_STATES = ("sticking", "sliding", "open")
 """Names of the values 0, 1, 2 of `Scene.contact_state`."""
-
-
-class CSR(NamedTuple):
-    """A sparse block in compressed rows; columns are numbered within the column field, globally."""
-
-    indptr: Integers
-    indices: Integers
-    data: Floats
-
-
-class Columns(NamedTuple):
-    """For each column of a whole matrix the number of its field, and its number there."""
-
-    owner: Integers
-    local: Integers
 
 
 @dataclass(kw_only=True)
@@ -118,8 +111,6 @@ class Scene:
         material: data of the fixed-stress diagonals, None if unknown.
         metadata: where the scene comes from.
         rows: per field the half-open range of rows held here; None if all.
-        cells: per field the numbers in the whole scene of the cells held here; missing where they are
-            the `rows`. Errors name rows and cells by these.
     """
 
     dimension: int
@@ -134,7 +125,6 @@ class Scene:
     material: Material | None = None
     metadata: Metadata = field(default_factory=Metadata)
     rows: dict[str, tuple[int, int]] | None = None
-    cells: dict[str, Integers] = field(default_factory=dict)
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -149,98 +139,91 @@ class Scene:
         """Half-open global range of the rows of a field that are held here."""
         return self.rows[name] if self.rows is not None else (0, self.sizes[name])
 
-    def row_name(self, name: str, row: int) -> int:
-        """Number in the whole scene of a row of a field, given its place among those held here."""
-        bs = self.block_size(name)
-        if name in self.cells:
-            return int(self.cells[name][row // bs]) * bs + row % bs
-        return self.row_range(name)[0] + row
-
     @classmethod
     def from_matrix(
         cls,
         matrix: Any,
-        rhs: ArrayLike,
+        rhs: Any,
         fields: Mapping[str, Any],
         *,
         dimension: int,
         columns: Mapping[str, Any] | None = None,
-        cutter: Cutter | None = None,
+        order: str | Mapping[str, str] = "cell",
         **known: Any,
     ) -> Scene:
         """Cut one sparse matrix into the blocks of a scene.
 
         Args:
-            matrix: (n, n) in compressed rows: anything with `indptr`, `indices` and `data`, such as
-                a `scipy.sparse.csr_matrix`. Columns of a row come in any order.
-            rhs: (n,) right-hand side.
-            fields: field name to the rows of its equations, as an index array, range or slice.
-                Vector fields list all components of a cell before the next cell.
+            matrix: (n, n), a sparse matrix of scipy, a dense array, or anything with `indptr`, `indices` and `data` of
+                compressed rows. Columns of a row come in any order; entries of the same place are added.
+            rhs: (n,) right-hand side, or (n, 1).
+            fields: field name to the rows of its equations: numbers, a range, a slice or a mask.
             dimension: of the rock matrix.
             columns: field name to the columns of its unknowns, where they differ from the rows.
-            cutter: remembers how a matrix was cut, which makes it faster for the next one of the same pattern.
-            known: further attributes of the scene (`material`, `cell_centers`, `reference`, ...).
+            order: of the numbers of vector fields: "cell" for all components of a cell before the next cell, or
+                "component" for the first component of all cells before the second; one word for all, or one for each
+                field. A scene is numbered cell by cell: its rows are then `numbers.reshape(dimension, -1).T.ravel()`.
+            known: further attributes of the scene, numbered as it is (`material`, `cell_centers`, `reference`, ...).
 
         Raises:
-            LayoutError: a row or column belongs to no field or to two, or rows and columns of a
-                field differ in number, or matrix and right-hand side do.
-            SceneError: a number is complex or not finite.
+            LayoutError: a row or column belongs to no field or to two, or rows and columns of a field differ in number,
+                or matrix and right-hand side do.
+            SceneError: a number is complex or not finite; the order is another one than said; or see `compressed`.
+            UsageError: there is no such order.
         """
-        if np.iscomplexobj(matrix.data) or np.iscomplexobj(rhs):
-            raise SceneError("matrix or rhs is complex; a scene is real")
-        b = np.asarray(rhs, dtype=np.float64)
-        n = b.size
-        if getattr(matrix, "format", "csr") != "csr":
-            raise LayoutError(f"matrix: expected compressed rows (csr), found {matrix.format}")
-        if b.ndim != 1 or np.size(matrix.indptr) != n + 1:
-            raise LayoutError(f"matrix has {np.size(matrix.indptr) - 1} rows, rhs has shape {b.shape}")
-        if np.size(matrix.indices) and not (0 <= np.min(matrix.indices) and np.max(matrix.indices) < n):
-            raise LayoutError(f"matrix: a column number is outside 0:{n}")
+        b = real_numbers(rhs.toarray() if hasattr(rhs, "toarray") else rhs, "rhs")
+        if b.size == max(b.shape, default=0):
+            b = b.ravel()
+        n, (whole, width) = b.size, compressed(matrix)
+        if b.ndim != 1 or whole.indptr.size != n + 1:
+            raise LayoutError(f"matrix has {whole.indptr.size - 1} rows, rhs has shape {b.shape}")
+        if width not in (None, n):
+            raise LayoutError(f"matrix: has {n} rows and {width} columns, and must be square")
+        check_csr(whole, n, n, "matrix")
+        for unknown in set(fields) - set(FIELD_NAMES):
+            raise LayoutError(f"unknown field {unknown!r}; fields are {', '.join(FIELD_NAMES)}")
         if columns is not None and set(columns) != set(fields):
             raise LayoutError(f"columns are given for {', '.join(columns)}; rows for {', '.join(fields)}")
         names = in_order(fields)
-        for unknown in set(fields) - set(FIELD_NAMES):
-            raise LayoutError(f"unknown field {unknown!r}; fields are {', '.join(FIELD_NAMES)}")
-        row_ids = {f: _indices(fields[f], n) for f in names}
-        whole = CSR(np.asarray(matrix.indptr, dtype=np.int64), np.asarray(matrix.indices), np.asarray(matrix.data))
-        col_ids = {f: _indices(columns[f], n) for f in names} if columns is not None else row_ids
+        orders = dict.fromkeys(names, order) if isinstance(order, str) else {f: order.get(f, "cell") for f in names}
+        if not {*orders.values()} <= {"cell", "component"}:
+            raise UsageError(f"order: expected cell or component, found {order!r}")
+
+        def numbers(given: Mapping[str, Any], what: str) -> dict[str, Integers]:
+            found = {f: _numbers(given[f], n, f"{f}: {what} numbers") for f in names}
+            for f, ids in found.items():
+                bs = FIELD[f].block_size(dimension)
+                if orders[f] == "component" and ids.size % bs == 0:
+                    found[f] = ids.reshape(bs, -1).T.ravel()
+            return found
+
+        row_ids = numbers(fields, "row")
+        col_ids = row_ids if columns is None else numbers(columns, "column")
         for f in names:
             if row_ids[f].size != col_ids[f].size:
                 raise LayoutError(f"{f}: {row_ids[f].size} rows but {col_ids[f].size} columns; they must pair up")
         _inverse(row_ids, n, "row")
         target = _inverse(col_ids, n, "column")
-
-        blocks: dict[tuple[str, str], CSR] = {}
-        for r in names:
-            if cutter is not None:
-                cut = cutter.cut(r, whole, row_ids[r], target, len(names))
-            else:
-                cut = cut_rows(whole, row_ids[r], target, len(names))
-            blocks |= {(r, c): block for c, block in zip(names, cut, strict=True) if block.data.size}
-        scene = cls(
-            dimension=dimension,
-            sizes={f: row_ids[f].size for f in names},
-            blocks=blocks,
-            rhs={f: b[row_ids[f]] for f in names},
-            **known,
-        )
-        scene.validate(cutter.valid if cutter is not None else None)
-        if cutter is not None:
-            cutter.valid = {rc: (block.indptr, block.indices) for rc, block in blocks.items()}
+        blocks = {
+            (r, c): block
+            for r in names
+            for c, block in zip(names, cut_rows(whole, row_ids[r], *target, len(names)), strict=True)
+            if block.data.size
+        }
+        sizes, parts = {f: ids.size for f, ids in row_ids.items()}, {f: b[ids] for f, ids in row_ids.items()}
+        scene = cls(dimension=dimension, sizes=sizes, blocks=blocks, rhs=parts, **known)
+        scene.validate()
         return scene
 
-    def validate(self, valid: Mapping[tuple[str, str], tuple[Integers, Integers]] | None = None) -> None:
+    def validate(self) -> None:
         """Check that all parts fit together and are finite.
 
         Local: looks at the rows held here and does not communicate.
 
-        Args:
-            valid: `indptr` and `indices` of blocks that have passed in a scene of the same sizes: where a block has
-                these very arrays, only its values are looked at.
-
         Raises:
             LayoutError: a length, block size or column number is wrong.
-            SceneError: a number is not finite, or a value is outside its range.
+            SceneError: a number is not finite, or a value is outside its range, or a field of a whole scene is numbered
+                component by component.
         """
         if self.dimension not in (2, 3):
             raise SceneError(f"dimension: expected 2 or 3, found {self.dimension}")
@@ -258,91 +241,141 @@ class Scene:
                 )
             if not 0 <= start <= stop <= size:
                 raise LayoutError(f"{name}: row range {start}:{stop} is not inside 0:{size}")
-            self._check_length(name, "rhs", self.rhs.get(name), stop - start)
-            if name in self.reference:
-                self._check_length(name, "reference", self.reference[name], stop - start)
-            cells = (stop - start) // bs
-            if name in self.cell_centers:
-                self._check_length(name, "cell_centers", self.cell_centers[name], cells, 3)
-            if name in self.cell_volumes:
-                self._check_length(name, "cell_volumes", self.cell_volumes[name], cells)
+            if name not in self.rhs:
+                raise LayoutError(f"{name}: rhs is missing")
+            rows, cells = (stop - start,), (stop - start) // bs
+            for what, shape in (
+                ("rhs", rows),
+                ("reference", rows),
+                ("cell_centers", (cells, 3)),
+                ("cell_volumes", (cells,)),
+            ):
+                if name in getattr(self, what):
+                    _check_array(f"{name}: {what}", getattr(self, what)[name], shape)
         for what in ("rhs", "reference", "cell_centers", "cell_volumes"):
             for name in set(getattr(self, what)) - set(self.sizes):
                 raise LayoutError(f"{what}: the scene has no field {name!r}")
-        self._check_blocks(valid or {})
+        for rc, block in self.blocks.items():
+            self._check_block(*rc, block)
         self._check_cell_data()
 
-    def _check_length(
-        self, name: str, what: str, values: NDArray[Any] | None, length: int, width: int | None = None
-    ) -> None:
-        shape = (length,) if width is None else (length, width)
-        if values is None:
-            raise LayoutError(f"{name}: {what} is missing")
-        if values.shape != shape:
-            raise LayoutError(f"{name}: {what} has shape {values.shape}, expected {shape}")
-        if not np.isfinite(values).all():
-            raise SceneError(f"{name}: {what} has an entry that is not finite (NaN or Inf)")
-
-    def _check_blocks(self, valid: Mapping[tuple[str, str], tuple[Integers, Integers]]) -> None:
-        for (r, c), block in self.blocks.items():
-            indptr, indices = valid.get((r, c), (None, None))
-            if block.indptr is not indptr or block.indices is not indices:
-                self._check_pattern(r, c, block)
-            self._check_values(r, c, block)
-
-    def _check_pattern(self, r: str, c: str, block: CSR) -> None:
+    def _check_block(self, r: str, c: str, block: CSR) -> None:
+        what = f"block ({r}, {c})"
         for name in (r, c):
             if name not in self.sizes:
-                raise LayoutError(f"block ({r}, {c}): the scene has no field {name!r}")
+                raise LayoutError(f"{what}: the scene has no field {name!r}")
         start, stop = self.row_range(r)
-        if block.indptr.dtype.kind not in "iu" or block.indices.dtype.kind not in "iu":
-            raise LayoutError(f"block ({r}, {c}): indptr and indices must be integers")
-        if block.indptr.shape != (stop - start + 1,):
-            raise LayoutError(f"block ({r}, {c}): indptr has {block.indptr.size} entries, expected {stop - start + 1}")
-        if block.indptr[0] != 0 or (block.indptr[1:] < block.indptr[:-1]).any():
-            raise LayoutError(f"block ({r}, {c}): indptr must start at 0 and not decrease")
-        if not block.indptr[-1] == block.indices.size == block.data.size:
-            raise LayoutError(
-                f"block ({r}, {c}): indptr ends at {block.indptr[-1]}, but there are "
-                f"{block.indices.size} indices and {block.data.size} values"
-            )
-        if block.indices.size and not (0 <= block.indices.min() and block.indices.max() < self.sizes[c]):
-            raise LayoutError(f"block ({r}, {c}): a column number is outside 0:{self.sizes[c]}")
+        check_csr(block, stop - start, self.sizes[c], what)
         if not increasing(block):
-            raise LayoutError(f"block ({r}, {c}): columns of a row must increase, without duplicates")
-
-    def _check_values(self, r: str, c: str, block: CSR) -> None:
+            raise LayoutError(f"{what}: columns of a row must increase, without duplicates")
         if not np.isfinite(block.data).all():
             at = np.flatnonzero(~np.isfinite(block.data))[0]
             row = int(np.searchsorted(block.indptr, at, side="right")) - 1
-            raise SceneError(
-                f"block ({r}, {c}): row {self.row_name(r, row)} has an entry that is not finite (NaN or Inf)"
-            )
+            raise SceneError(f"{what}: row {start + row} has an entry that is not finite (NaN or Inf)")
+        if r == c and self.rows is None:
+            check_order(r, self.dimension, self.sizes[r], lambda start, stop: csr_rows(block, start, stop))
 
     def _check_cell_data(self) -> None:
         if self.contact_state is not None:
             start, stop = self.row_range("contact") if "contact" in self.sizes else (0, 0)
-            cells = (stop - start) // self.dimension
-            if self.contact_state.shape != (cells,):
-                raise LayoutError(f"contact_state has shape {self.contact_state.shape}, expected {(cells,)}")
+            _check_array("contact_state", self.contact_state, ((stop - start) // self.dimension,))
             if not np.isin(self.contact_state, range(len(CONTACT_STATES))).all():
                 raise SceneError("contact_state: expected 0 (sticking), 1 (sliding) or 2 (open)")
         if "mass" not in self.sizes:
             return
         start, stop = self.row_range("mass")
         if self.cell_dimension is not None:
-            self._check_length("mass", "cell_dimension", self.cell_dimension, stop - start)
+            _check_array("mass: cell_dimension", self.cell_dimension, (stop - start,))
             if ((self.cell_dimension < 0) | (self.cell_dimension > self.dimension)).any():
                 raise SceneError(f"mass: cell_dimension must lie between 0 and {self.dimension}")
         if self.material is not None:
             for name, value in self.material.cell_data().items():
                 values = np.asarray(value, dtype=np.float64)
-                if values.ndim:
-                    self._check_length("mass", name, values, stop - start)
-                elif not np.isfinite(values):
-                    raise SceneError(f"material: {name} is not finite")
+                _check_array(f"material: {name}", values, (stop - start,) if values.ndim else ())
             if not (np.isfinite(self.material.time_step) and self.material.time_step > 0):
                 raise SceneError(f"material: time_step must be positive, found {self.material.time_step}")
+
+    def check_rows(self) -> None:
+        """Check that each equation held here has an entry other than zero, and in a whole scene each unknown, too.
+
+        Local: does not communicate.
+
+        Raises:
+            SceneError: one has none, so that the matrix is singular; field, cell and component are named.
+        """
+        found: dict[tuple[str, str], NDArray[np.bool_]] = {}
+        for (r, c), block in self.blocks.items():
+            full = block.data != 0
+            ends = np.concatenate([[0], np.cumsum(full)])[block.indptr]
+            seen = [(("equation", r), ends[1:] > ends[:-1])]
+            if self.rows is None:
+                used = np.zeros(self.sizes[c], dtype=bool)
+                used[block.indices[full]] = True
+                seen.append((("unknown", c), used))
+            for key, mask in seen:
+                found[key] = found.get(key, False) | mask
+        for name in self.fields:
+            start, stop = self.row_range(name)
+            for kind in ("equation", "unknown") if self.rows is None else ("equation",):
+                empty = np.flatnonzero(~found.get((kind, name), np.zeros(stop - start, dtype=bool)))
+                if empty.size:
+                    cell, component = divmod(start + int(empty[0]), self.block_size(name))
+                    which = f", component {'xyz'[component]}," if self.block_size(name) > 1 else ""
+                    among = f" ({empty.size} such {kind}s)" if empty.size > 1 else ""
+                    raise SceneError(
+                        f"{name}: the {kind} of cell {cell}{which} has no entry or only zeros in the matrix{among}, "
+                        "which is singular so; leave the cell out, or give it a row with 1 on the diagonal"
+                    )
+
+    def fixed_stress_coefficients(self) -> Floats | None:
+        """What the fixed-stress diagonal is made of, for the mass rows held here (paper, eq:fixed_stress_coefs).
+
+        With cell volume V, fluid density rho and time step dt, the diagonal for damping exponent t is
+        `first * second ** t`, where
+
+        - rock: first = l_min V rho / dt, second = l_mat / l_min, with l_mat = alpha^2 / (2 G / D + lambda)
+          and l_min = alpha^2 / (4 G + 2 lambda);
+        - fractures: first = l_frac V rho / dt, second = 1, with
+          l_frac = [u]_n alpha^2 c_f / (lambda (1/M + phi c_f)), 1/M = (alpha - phi)(1 - alpha) / (lambda + 2 G / 3);
+          and c_f / (1/M + phi c_f) = 1 / phi where neither rock nor fluid stores anything;
+        - intersections: 0, as they do not touch the momentum balance.
+
+        The paper has t = 1; its published code has t = 0.6.
+
+        Local: does not communicate.
+
+        Returns:
+            (mass rows, 2), or None where the scene lacks material data, cell volumes or cell dimensions.
+
+        Raises:
+            SceneError: the coefficients are not finite.
+        """
+        m = self.material
+        if m is None or "mass" not in self.cell_volumes or self.cell_dimension is None:
+            return None
+        rows = self.cell_dimension.size
+        G, lame, alpha, phi, c_f, rho, jump = (
+            np.broadcast_to(np.asarray(value, dtype=np.float64), rows) for value in m.cell_data().values()
+        )
+        scale = self.cell_volumes["mass"] * rho / m.time_step
+        rock, fracture = self.cell_dimension == self.dimension, self.cell_dimension == self.dimension - 1
+        with np.errstate(divide="ignore", invalid="ignore"):
+            l_min = alpha**2 / (4 * G + 2 * lame)
+            inverse_biot_modulus = (alpha - phi) * (1 - alpha) / (lame + 2 * G / 3)
+            storage = inverse_biot_modulus + phi * c_f
+            share = np.where(
+                storage == 0, 1 / phi, c_f / storage
+            )  # without any storage its limit for 1/M = 0, c_f -> 0
+            l_frac = jump * alpha**2 * share / lame
+            first = np.select([rock, fracture], [l_min * scale, l_frac * scale])
+            second = np.where(rock, (4 * G + 2 * lame) / (2 * G / self.dimension + lame), 1.0)
+        result = np.column_stack([first, second])
+        if not np.isfinite(result).all():
+            raise SceneError(
+                "material: the fixed-stress coefficients are not finite (G, lambda and 1/M + phi c_f must not "
+                "vanish); correct the material data, or leave it out and use -fs_type algebraic"
+            )
+        return result
 
     def only(self, fields: Iterable[str]) -> Scene:
         """The part of a scene with these fields, its rows and columns; the rest is forgotten."""
@@ -363,164 +396,94 @@ class Scene:
             contact_state=self.contact_state if "contact" in names else None,
             material=self.material if "mass" in names else None,
             rows=None if self.rows is None else part(self.rows),
-            cells=part(self.cells),
         )
 
-    def restrict(self, where: Layout | Mapping[str, tuple[int, int]]) -> Scene:
-        """The part of a whole scene that one rank holds, numbered as the layout.
+    def restrict(self, rows: Mapping[str, tuple[int, int]]) -> Scene:
+        """The part of a whole scene that one rank holds; its arrays are views.
 
         Local: does not communicate.
 
         Args:
-            where: a layout, for its part on this rank; or per field a half-open range of rows, whole cells.
+            rows: per field a half-open range of rows, whole cells.
 
         Raises:
-            LayoutError: the scene is a part already, or `where` lacks a field, is for another size or cuts
-                through a cell.
+            LayoutError: the scene is a part already, or `rows` lacks a field, goes beyond it or cuts through a cell.
         """
         if self.rows is not None:
             raise LayoutError("restrict: the scene is already the part of one rank")
-        own, places = {}, {}
-        rows = dict(where) if isinstance(where, Mapping) else {f: where.rows(f) for f in where.fields}
         for name, size in self.sizes.items():
             if name not in rows or not 0 <= rows[name][0] <= rows[name][1] <= size:
                 raise LayoutError(f"{name}: row range {rows.get(name)} is not inside 0:{size}")
-            if isinstance(where, Mapping):
-                own[name] = np.arange(*(n // self.block_size(name) for n in rows[name]))
-                continue
-            if where.sizes(name)[1] != size:
-                raise LayoutError(f"{name}: {size} rows in the scene, {where.sizes(name)[1]} in the layout")
-            own[name] = where.own_cells(name)
-            if name in where.cells:
-                places[name] = where.places(name)
-        own_rows = {f: rows_of(cells, self.block_size(f)) for f, cells in own.items()}
+        ranges = {f: (int(rows[f][0]), int(rows[f][1])) for f in self.sizes}
+
+        def of_rows(values: Mapping[str, Floats]) -> dict[str, Floats]:
+            return {f: v[slice(*ranges[f])] for f, v in values.items()}
 
         def of_cells(values: Any, name: str) -> Any:
-            return values[own[name]] if values is not None and name in own else None
+            if np.ndim(values) == 0:  # also None
+                return values
+            return np.asarray(values)[slice(*(n // self.block_size(name) for n in ranges[name]))]
 
-        material = self.material if "mass" in self.sizes else None
+        material = self.material
         if material is not None:
-            cut = {k: v if np.ndim(v) == 0 else np.asarray(v)[own["mass"]] for k, v in material.cell_data().items()}
-            material = Material(**cut, time_step=material.time_step)
-        part = Scene(
-            dimension=self.dimension,
-            sizes=dict(self.sizes),
-            blocks={
-                (r, c): _renumbered(_take_rows(b, own_rows[r]), places.get(c), self.block_size(c))
-                for (r, c), b in self.blocks.items()
-            },
-            rhs={f: v[own_rows[f]] for f, v in self.rhs.items()},
-            reference={f: v[own_rows[f]] for f, v in self.reference.items()},
-            cell_centers={f: v[own[f]] for f, v in self.cell_centers.items()},
-            cell_volumes={f: v[own[f]] for f, v in self.cell_volumes.items()},
+            own = {k: of_cells(v, "mass") for k, v in material.cell_data().items()}
+            material = Material(**own, time_step=material.time_step)
+        part = replace(
+            self,
+            blocks={(r, c): csr_rows(block, *ranges[r]) for (r, c), block in self.blocks.items()},
+            rhs=of_rows(self.rhs),
+            reference=of_rows(self.reference),
+            cell_centers={f: of_cells(v, f) for f, v in self.cell_centers.items()},
+            cell_volumes={f: of_cells(v, f) for f, v in self.cell_volumes.items()},
             cell_dimension=of_cells(self.cell_dimension, "mass"),
             contact_state=of_cells(self.contact_state, "contact"),
             material=material,
-            metadata=self.metadata,
-            rows={f: (int(a), int(b)) for f, (a, b) in rows.items()},
-            cells={f: own[f] for f in places},
+            rows=ranges,
         )
         part.validate()
         return part
 
 
-def _take_rows(block: CSR, rows: Integers) -> CSR:
-    """Some rows of a block, in the order given; without a copy if they follow each other."""
-    if not rows.size or (np.diff(rows) == 1).all():
-        return csr_rows(block, int(rows[0]), int(rows[-1]) + 1) if rows.size else csr_rows(block, 0, 0)
-    take, counts = gather_rows(block.indptr, rows)
-    return CSR(np.concatenate([[0], np.cumsum(counts)]), block.indices[take], block.data[take])
+def contact_state_counts(states: Iterable[int]) -> dict[str, int]:
+    """Number of fracture cells in each contact state."""
+    counts = np.bincount(np.asarray(list(states), dtype=np.int64), minlength=len(CONTACT_STATES))
+    return dict(zip(CONTACT_STATES, counts.tolist(), strict=True))
 
 
-def _renumbered(block: CSR, places: Integers | None, block_size: int) -> CSR:
-    """A block with other column numbers, see `renumber`; the same block where there are none."""
-    if places is None:
-        return block
-    out = CSR(block.indptr, np.empty_like(block.indices), np.empty_like(block.data))
-    renumber(block, places, block_size, out)
-    return out
+def check_order(name: str, dimension: int, size: int, rows: Callable[[int, int], CSR]) -> None:
+    """Refuse a field whose diagonal block is clearly numbered component by component, see `by_component`.
 
-
-def increasing(block: CSR) -> bool:
-    """Whether the columns of each row increase, without duplicates."""
-    for a, b, start, stop in slabs(block.indptr, SLAB):
-        columns = block.indices[start:stop]
-        falls = columns[1:] <= columns[:-1]
-        ends = block.indptr[a + 1 : b] - start  # rows may begin anywhere
-        falls[ends[(ends > 0) & (ends < columns.size)] - 1] = False
-        if falls.any():
-            return False
-    return True
-
-
-def renumber(block: CSR, places: Integers, block_size: int, out: CSR) -> None:
-    """Give columns other numbers and sort them again.
-
-    Args:
-        block: rows of a block.
-        places: (cells of the columns,) the new number of each cell.
-        block_size: unknowns per cell of the columns.
-        out: of the same rows; may be `block` itself.
+    Raises:
+        LayoutError: it is.
     """
-    numbers = (places[:, None] * block_size + np.arange(block_size)).ravel()
-    for a, b, start, stop in slabs(block.indptr, SLAB):
-        columns = numbers[block.indices[start:stop]]
-        rows = np.repeat(np.arange(b - a), np.diff(block.indptr[a : b + 1]))
-        order = np.argsort(rows * (places.size * block_size) + columns, kind="stable")
-        out.indices[start:stop], out.data[start:stop] = columns[order], block.data[start:stop][order]
+    if by_component(rows, size, FIELD[name].block_size(dimension)):
+        raise LayoutError(
+            f"{name}: the unknowns are numbered component by component (all of x, then all of y), expected all "
+            'components of a cell before the next cell: as Scene.from_matrix(..., order="component") numbers them'
+        )
 
 
-def slabs(indptr: Integers, entries: int) -> Iterator[tuple[int, int, int, int]]:
-    """Groups of whole rows with about so many entries each: first and last row, first and last entry (half-open)."""
-    a, n = 0, indptr.size - 1
-    while a < n:
-        b = max(a + 1, int(np.searchsorted(indptr, int(indptr[a]) + entries, side="right")) - 1)
-        yield a, b, int(indptr[a]), int(indptr[b])
-        a = b
-
-
-def csr_rows(block: CSR, start: int, stop: int) -> CSR:
-    """Rows start:stop of a block."""
-    a, b = block.indptr[start], block.indptr[stop]
-    return CSR(block.indptr[start : stop + 1] - a, block.indices[a:b], block.data[a:b])
-
-
-def diagonal_blocks(block: CSR, size: int) -> Floats:
-    """The blocks on the diagonal of a square block, dense.
-
-    Args:
-        block: rows and columns numbered alike.
-        size: of the diagonal blocks.
-
-    Returns:
-        (rows / size, size, size).
-    """
-    rows = np.repeat(np.arange(block.indptr.size - 1), np.diff(block.indptr))
-    inside = rows // size == block.indices // size
-    dense = np.zeros(((block.indptr.size - 1) // size, size, size))
-    dense[rows[inside] // size, rows[inside] % size, block.indices[inside] % size] = block.data[inside]
-    return dense
-
-
-def singular(dense: Floats) -> NDArray[np.bool_]:
-    """Which matrices of a stack (n, size, size) are singular to rounding, not finite ones included."""
-    values = np.linalg.svd(dense, compute_uv=False)
-    return np.asarray(~(values[:, -1] > ALMOST_SINGULAR * values[:, 0]))
-
-
-def singular_diagonal_blocks(block: CSR, size: int) -> int:
-    """Number of singular diagonal blocks of a square block, see `diagonal_blocks`."""
-    return int(np.count_nonzero(singular(diagonal_blocks(block, size))))
-
-
-def _indices(spec: Any, n: int) -> Integers:
-    """Index array from an array, range or slice."""
+def _numbers(spec: Any, n: int, what: str) -> Integers:
+    """Index array from numbers, a range, a slice or a mask."""
     if isinstance(spec, slice):
-        return np.arange(*spec.indices(n))
-    return np.asarray(spec, dtype=np.int64).ravel()
+        return np.arange(n)[spec]
+    array = array_of(spec)
+    if array.dtype.kind == "b":
+        if array.shape != (n,):
+            raise LayoutError(f"{what}: a mask has shape {array.shape}, expected {(n,)}")
+        return np.flatnonzero(array)
+    return whole_numbers(array, what).ravel()
 
 
-def _inverse(ids: Mapping[str, Integers], n: int, what: str) -> Columns:
+def _check_array(what: str, values: NDArray[Any], shape: tuple[int, ...]) -> None:
+    shape = tuple(map(int, shape))  # integers of numpy are printed otherwise
+    if values.shape != shape:
+        raise LayoutError(f"{what} has shape {values.shape}, expected {shape}")
+    if not np.isfinite(values).all():
+        raise SceneError(f"{what} {'has an entry that ' if shape else ''}is not finite (NaN or Inf)")
+
+
+def _inverse(ids: Mapping[str, Integers], n: int, what: str) -> tuple[Integers, Integers]:
     """For each index the number of its field and its place there.
 
     Raises:
@@ -530,7 +493,7 @@ def _inverse(ids: Mapping[str, Integers], n: int, what: str) -> Columns:
     local: Integers = np.zeros(n, dtype=np.int32 if n < 2**31 else np.int64)
     for k, (name, index) in enumerate(ids.items()):
         if index.size and not (0 <= index.min() and index.max() < n):
-            raise LayoutError(f"{name}: a {what} number is outside 0:{n}")
+            raise LayoutError(f"{name}: a {what} number is outside 0:{n}; they begin at 0")
         if (owner[index] >= 0).any() or np.unique(index).size != index.size:
             raise LayoutError(f"{name}: a {what} is listed twice or belongs to two fields")
         owner[index] = k
@@ -538,61 +501,4 @@ def _inverse(ids: Mapping[str, Integers], n: int, what: str) -> Columns:
     missing = np.flatnonzero(owner < 0)
     if missing.size:
         raise LayoutError(f"{missing.size} {what}s belong to no field, the first is {missing[0]}")
-    return Columns(owner, local)
-
-
-def gather_rows(indptr: Integers, rows: Integers) -> tuple[Integers, Integers]:
-    """Positions of all entries of the given rows, row by row, and the number of entries of each."""
-    counts = np.diff(indptr)[rows]
-    offset = np.cumsum(counts) - counts
-    return np.asarray(np.repeat(indptr[rows] - offset, counts) + np.arange(counts.sum())), counts
-
-
-def _sorted_rows(rows: Integers, cols: Integers, data: Floats, n: int) -> CSR:
-    """Compressed rows with sorted columns from triplets whose rows do not decrease."""
-    indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))])
-    place = rows.astype(np.int64) * (int(cols.max(initial=0)) + 1) + cols
-    if (place[1:] < place[:-1]).any():
-        order = np.argsort(place, kind="stable")  # which is fast where most of it is in order, as here
-        cols, data = cols[order], data[order]
-    return CSR(indptr, cols, data)
-
-
-def cut_rows(matrix: CSR, rows: Integers, target: Columns, parts: int) -> list[CSR]:
-    """Some rows of a matrix, cut by the owners of their columns, which are renumbered and sorted."""
-    blocks: list[list[CSR]] = [[] for _ in range(parts)]
-    for piece in _pieces(matrix.indptr, rows):
-        take, counts = gather_rows(matrix.indptr, piece)
-        cols, data = matrix.indices[take], matrix.data[take].astype(np.float64, copy=False)
-        row_of = np.repeat(np.arange(piece.size), counts)
-        owners = target.owner[cols]
-        for k, block in enumerate(blocks):
-            mine = owners == k
-            block.append(_sorted_rows(row_of[mine], target.local[cols[mine]], data[mine], piece.size))
-    return [_stack(block) for block in blocks]
-
-
-def _pieces(indptr: Integers, rows: Integers) -> list[Integers]:
-    """Rows in their order, cut where about `SLAB` entries are full."""
-    full = np.cumsum(indptr[rows + 1] - indptr[rows]) // SLAB
-    return list(np.split(rows, np.flatnonzero(np.diff(full)) + 1))
-
-
-def _stack(parts: list[CSR]) -> CSR:
-    """Blocks below each other as one; the list is emptied on the way, so that little is held twice."""
-    if len(parts) == 1:
-        return parts[0]
-    ends = np.cumsum([part.data.size for part in parts])
-    indptr = np.concatenate([parts[0].indptr, *(p.indptr[1:] + e for p, e in zip(parts[1:], ends, strict=False))])
-    indices, data = np.empty(ends[-1], dtype=parts[0].indices.dtype), np.empty(ends[-1])
-    for end in ends[::-1]:
-        part = parts.pop()
-        indices[end - part.data.size : end] = part.indices
-        data[end - part.data.size : end] = part.data
-    return CSR(indptr, indices, data)
-
-
-def contact_state_counts(states: Iterable[int]) -> dict[str, int]:
-    """Number of fracture cells in each contact state."""
-    counts = np.bincount(np.asarray(list(states), dtype=np.int64), minlength=len(CONTACT_STATES))
-    return dict(zip(CONTACT_STATES, counts.tolist(), strict=True))
+    return owner, local

@@ -10,9 +10,9 @@ rank 0 asks of them, as with PETSc's own `-mpi_linear_solver_server` (PCMPI), wh
         solver.update(next_scene)
         client.stop()
 
-Where a scene goes is decided once, by its partition. Each block is a PETSc matrix that is filled from the entries rank 0
-has (MatSetPreallocationCOO, and MatSetValuesCOO for new values): PETSc itself knows which goes where. Blocks whose
-pattern has changed are laid out anew, the others only get values.
+Where a scene goes is decided once, by its partition. Each block is a PETSc matrix that is filled from the entries
+rank 0 has (MatSetPreallocationCOO, and MatSetValuesCOO for new values): PETSc itself knows which goes where. Blocks
+whose pattern has changed are laid out anew, the others only get values.
 """
 
 from __future__ import annotations
@@ -138,7 +138,8 @@ def start(comm: MPI.Intracomm | None = None) -> Client | None:
     global _client  # noqa: PLW0603
     if _client is not None:
         return _client
-    import petsc_fs.solver  # noqa: F401  (its work at exit comes after the stop, on all ranks alike)
+    import petsc_fs.pc
+    import petsc_fs.solver  # noqa: F401  (what they do at exit comes after the stop, on all ranks alike)
 
     _restore_terminate()
     comm = comm or MPI.COMM_WORLD

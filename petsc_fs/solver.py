@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import gc
 import itertools
-import math
 import time
 import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-
 
 import numpy as np
 from mpi4py import MPI
@@ -19,19 +17,16 @@ from petsc4py import PETSc
 
 from petsc_fs import nest
 from petsc_fs import options as database
-from petsc_fs.errors import SceneError, SolveError, UsageError
+from petsc_fs.errors import SceneError, UsageError
 from petsc_fs.partition import Layout, chosen, partition
-from petsc_fs.petsc_errors import brief, reason_name, translate
+from petsc_fs.petsc_errors import brief, translate
+from petsc_fs.refinement import PETSC_ATOL, Refinement
 from petsc_fs.result import Result
 from petsc_fs.scene import Scene
-from petsc_fs.system import EPS, FieldArrays, System, norm
+from petsc_fs.singular import attach, describe, null_vectors
+from petsc_fs.system import FieldArrays, System, norm
 
 __all__ = ["Result", "Solver"]
-
-MOST_PASSES = 20
-"""The Krylov method and its corrections; each has to halve what is missing."""
-NOT_FINITE = ("DIVERGED_NANORINF", "DIVERGED_PCSETUP_FAILED", "DIVERGED_PC_FAILED")
-"""PETSc's reasons that point at a level which broke down."""
 
 
 class Solver:
@@ -94,7 +89,7 @@ class Solver:
         self.left_out = self._chosen.left_out
         self._retry: _Retry | None = None
         with self._options():
-            self.system = System(self.layout, root_only=root_only, coordinates=needs_coordinates(prefix))
+            self.system = System(self.layout, root_only=root_only, near_null_space=needs_near_null_space(prefix))
             self.system.take(self._scene, release=release)
             self._forget_blocks()
             self.ksp = self._make_ksp(prefix)
@@ -120,7 +115,7 @@ class Solver:
         if self._scene is not None:
             alone = PETSc.COMM_SELF.tompi4py()
             facts = database.Facts.of(self._scene, alone if self._root_only else comm)
-        return database.choose(comm.bcast(facts) if self._root_only else facts)
+        return database.choose(comm.bcast(facts) if self._root_only or facts is None else facts)
 
     @contextmanager
     def _options(self) -> Iterator[None]:
@@ -214,6 +209,8 @@ class Solver:
         self.set_up()
         with self._options():
             result = self._run(self.ksp, wanted)
+            if not result.converged:
+                result = self._look_for_null_vectors(result, wanted)
         retry = PETSc.Options(self.prefix).getString("petsc_fs_retry", "none")
         if not result.converged and retry != "none":
             result = self._solve_again(retry, wanted, result)
@@ -225,7 +222,7 @@ class Solver:
         """The Krylov method and its corrections, and what comes of them. Collective."""
         started = time.perf_counter()
         system = self.system
-        run = _Run(system, ksp, wanted, self._atol if self._atol > PETSC_ATOL else 0.0)
+        run = Refinement(system, ksp, wanted, self._atol if self._atol > PETSC_ATOL else 0.0)
         try:
             run.first()
             run.correct()
@@ -253,6 +250,21 @@ class Solver:
             solve_seconds=time.perf_counter() - started,
             solution=solution,
             notes=run.notes,
+        )
+
+    def _look_for_null_vectors(self, result: Result, wanted: float) -> Result:
+        """Where a solve has failed as the system is singular, say so, and solve without its null space. Collective."""
+        vectors = null_vectors(self.system)
+        if not vectors:
+            return result
+        note = describe(self.system, vectors)
+        attach(self.system, self._matrix, vectors)
+        again = self._run(self.ksp, wanted)
+        return replace(
+            again,
+            iterations=result.iterations + again.iterations,
+            solve_seconds=result.solve_seconds + again.solve_seconds,
+            notes=(note + (". Solved for the solution without it" if again.converged else ""), *again.notes),
         )
 
     def _errors(self, solution: FieldArrays) -> dict[str, float]:
@@ -300,195 +312,6 @@ class Solver:
             _, _, (_, parts), _ = found
             parts.destroy()
             PETSc.garbage_cleanup(self.layout.comm)
-
-
-PETSC_ATOL = 1e-50
-"""PETSc's own absolute tolerance, which stands for none."""
-MARGIN = 0.3
-"""Part of a tolerance that the Krylov method is given, whose norm is not the user's: without it most solves would
-need a correction, with it they need at most two iterations more."""
-LEAST_RTOL = 1e-12
-"""Tolerance of the Krylov method that its recursion can still keep."""
-WELL_DETERMINED = 1e-3
-"""Estimated relative error of each field up to which a solution is taken as it is."""
-DETERMINED = 1e-2
-"""Relative error of each field, where it is measured, up to which a solution counts as one."""
-MEASURE = 0.1
-"""Relative tolerance where errors are measured."""
-MOST_IMPROVEMENTS = 3
-"""Corrections for the sake of the estimated error."""
-LIMIT = 1e-14
-"""Backward error that no correction lessens any more."""
-
-
-class _Run:
-    """One solve: a Krylov method on the equilibrated system, and corrections as the user's system asks for them.
-
-    Attributes:
-        x: the solution so far, of the system as it is in PETSc.
-        check: how well it satisfies the user's system.
-        missing: by what factor it misses the tolerances.
-        goal: tolerance of the residual, relative to |b|.
-        field_goal: backward error that each field may have.
-        estimates: estimated relative error of each field.
-        is_determined: whether the equations determine the solution to `DETERMINED`.
-    """
-
-    def __init__(self, system: System, ksp: PETSc.KSP, rtol: float, atol: float) -> None:
-        self.system, self.ksp, self.rtol = system, ksp, rtol
-        self.x, self.r, self.d = (system.b.duplicate() for _ in range(3))
-        self.max_it = int(ksp.getTolerances()[3])
-        self.iterations = self.passes = 0
-        self.reason = "CONVERGED_ATOL"
-        self.history: list[NDArray[np.float64]] = []
-        self.notes: tuple[str, ...] = ()
-        self.estimates: dict[str, float] = {}
-        self.is_determined = True
-        self.x.set(0.0)
-        self.check = system.check(self.x, self.r)
-        size = norm(self.check.rhs)
-        self.goal = max(rtol, math.ldexp(atol, system.rhs_scale) / size) if size else 1.0
-        self.field_goal = rtol
-        self.missing = self.check.excess(self.goal, self.field_goal) if size else 0.0
-
-    def first(self) -> None:
-        """The Krylov method by its options. Collective."""
-        if self.missing > 1.0:
-            self._pass(MARGIN * max(self.rtol, min(self.goal, 0.5)))
-            self.x.axpy(1.0, self.d)
-            self._judge()
-
-    def correct(self) -> None:
-        """Corrections, as long as each of them halves what is missing. Collective.
-
-        The Krylov method stops in the norm of the equilibrated system, by a recursion that rounding may lead astray.
-        """
-        if self.ksp.getType() == PETSc.KSP.Type.PREONLY:
-            return
-        while self.missing > 1.0 and self.passes < MOST_PASSES and self.iterations < self.max_it:
-            old = self.missing
-            self._pass(min(max(MARGIN / old, LEAST_RTOL), 0.5))
-            self._take_step()
-            if self.missing > 0.5 * old:
-                return
-
-    def _take_step(self) -> None:
-        """Add what the last pass has found, unless that makes it worse. Collective."""
-        old = self.missing
-        self.x.axpy(1.0, self.d)
-        self._judge()
-        if self.missing > max(old, 1.0):
-            self.x.axpy(-1.0, self.d)
-            self._judge()
-
-    def estimate_error(self) -> None:
-        """Estimate the error of each field; where that casts doubt, improve the solution, or measure it. Collective.
-
-        One application of the preconditioner to the residual is an estimate, divided by the least singular value that
-        GMRES has seen. To measure the error is to solve for a residual of this size with a part at random, whatever
-        the preconditioner is worth: a solution that the equations do not determine changes beyond measure.
-        """
-        if self.missing > 1.0 or not self.passes:
-            return
-        least, doubtful = self._least_singular_value(), self.system.has_weak_pivots()
-        for _ in range(MOST_IMPROVEMENTS):
-            self._precondition()
-            steps, eta = self._relative(self.d), max(self.check.backward.values())
-            self.estimates = {f: e / least for f, e in steps.items()}
-            if max(self.estimates.values()) <= WELL_DETERMINED and not doubtful:
-                return
-            step = max(steps.values())
-            final = eta <= LIMIT or self.ksp.getType() == PETSc.KSP.Type.PREONLY
-            if step <= WELL_DETERMINED or final:
-                found, doubtful = self._measured(), True
-                self.estimates = found or self.estimates
-                if found is not None and max(found.values()) <= DETERMINED:
-                    return
-                if final or found is None:
-                    break
-                step = max(found.values())
-            self._pass(min(max(MARGIN * WELL_DETERMINED / step, 1e-4), MARGIN))
-            least = min(least, self._least_singular_value())
-            self._take_step()
-            if self.missing > 1.0 or self.iterations >= self.max_it:
-                break
-        self.is_determined = False
-        found = {f: e for f, e in self.estimates.items() if not e <= DETERMINED} or self.estimates
-        self.notes += (
-            "ill-conditioned: the residual is small, but says little of the error, which is estimated at "
-            + ", ".join(f"{e:.0e} ({f})" for f, e in found.items())
-            + f" of the solution; at most {DETERMINED:g} counts as converged",
-        )
-
-    def _least_singular_value(self) -> float:
-        """The least one of A M^-1 that GMRES has seen, at most 1; 1 for other methods. Local."""
-        if self.ksp.getType() != PETSc.KSP.Type.GMRES or not self.ksp.getIterationNumber():
-            return 1.0
-        return min(1.0, max(float(self.ksp.computeExtremeSingularValues()[1]), EPS))
-
-    def _precondition(self) -> None:
-        """D = M^-1 r. Collective."""
-        try:
-            self.ksp.getPC().apply(self.r, self.d)
-        except (PETSc.Error, ImportError) as e:
-            raise translate(e, "the preconditioner failed") from None
-
-    def _measured(self) -> dict[str, float] | None:
-        """Relative size of what a residual of this size may be worth; None if that cannot be solved for. Collective."""
-        system = self.system
-        draw = np.random.default_rng(system.layout.comm.rank)
-        random = {f: draw.standard_normal(v.size) for f, v in system.by_field(self.r).items()}
-        there, sizes = system.norms(system.by_field(self.r)), system.norms(random)
-        parts = [v * (there[f] / (sizes[f] or 1.0)) for f, v in random.items()]
-        kept = self.r.copy()
-        self.r.setArray(self.r.getArray() + np.concatenate(parts))
-        self._pass(MEASURE)
-        kept.copy(self.r)
-        kept.destroy()
-        return self._relative(self.d) if self.reason.startswith("CONVERGED") else None
-
-    def _relative(self, part: PETSc.Vec) -> dict[str, float]:
-        """Size of each field of a vector beside that of the solution, or beside what would change any equation."""
-        sizes = self.system.norms(self.system.by_field(self.x))
-        least = self.system.least_sizes(self.check, self.field_goal)
-        found = self.system.norms(self.system.by_field(part))
-        return {f: n / (max(sizes[f], least[f]) or 1.0) for f, n in found.items()}
-
-    def _pass(self, rtol: float) -> None:
-        """Run a Krylov method on the present residual; what it finds is in `d`. Collective."""
-        ksp = self.ksp
-        ksp.setTolerances(rtol=rtol, atol=0.0, max_it=max(self.max_it - self.iterations, 1))
-        try:
-            ksp.solve(self.r, self.d)
-        except (PETSc.Error, ImportError) as e:
-            raise translate(e, "solve failed") from None
-        self.passes += 1
-        self.iterations += ksp.getIterationNumber()
-        self.history.append(np.array(ksp.getConvergenceHistory()))
-        self.reason = reason_name(ksp)
-
-    def _judge(self) -> None:
-        """See where x stands. Collective.
-
-        Raises:
-            SolveError: it is not finite.
-        """
-        self.check = self.system.check(self.x, self.r)
-        self.missing = self.check.excess(self.goal, self.field_goal)
-        if not math.isfinite(self.missing):
-            where = broken_level(self.ksp.getPC())
-            raise SolveError(
-                f"the solution is not finite after {self.iterations} iterations ({self.reason})"
-                + (f"; {where}" if where else "")
-            )
-        if self.missing > 1.0:
-            self.check = self.system.check(self.x, self.r, exactly=True)
-            self.missing = self.check.excess(self.goal, self.field_goal)
-
-    def destroy(self) -> None:
-        """Collective."""
-        for vector in (self.x, self.r, self.d):
-            vector.destroy()
 
 
 class _Parts:
@@ -543,33 +366,10 @@ def _set_up(ksp: PETSc.KSP) -> None:
         raise translate(e, "set-up failed") from None
 
 
-def needs_coordinates(prefix: str) -> bool:
+def needs_near_null_space(prefix: str) -> bool:
     """Whether the solver in the options database makes use of rigid-body modes. Local."""
     chosen = {k: str(v) for k, v in PETSc.Options().getAll().items() if k.startswith(prefix)}
     types = {v for k, v in chosen.items() if k.endswith("pc_type")}
     foreign = any(k.endswith("pc_python_type") and not v.startswith("petsc_fs.pc.") for k, v in chosen.items())
     nodal = any(k.endswith(("boomeramg_nodal_coarsen", "boomeramg_vec_interp_variant")) for k in chosen)
     return nodal or foreign or bool(types & {"gamg", "ml", "bddc", "hmg"})
-
-
-def broken_level(pc: PETSc.PC) -> str:
-    """The innermost level of a set-up tree that turns ones into numbers that are not finite; "" if there is none.
-
-    Collective.
-    """
-    for part in reversed(list(nest.levels(pc))):
-        x, y = part.getOperators()[1].createVecs()
-        x.set(1.0)
-        y.set(0.0)
-        try:
-            part.apply(x, y)
-            what = "" if math.isfinite(y.norm()) else "turns ones into numbers that are not finite"
-        except PETSc.Error as e:
-            what = f"fails (error {e.ierr})"
-        for v in (x, y):
-            v.destroy()
-        if what:
-            kind, prefix = part.getType(), f"-{part.getOptionsPrefix() or ''}"
-            hint = f"; if it is MUMPS, raise {prefix}mat_mumps_icntl_14" if kind in ("lu", "cholesky") else ""
-            return f"level {prefix} ({kind}) {what}{hint}"
-    return ""

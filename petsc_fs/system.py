@@ -18,15 +18,12 @@ from petsc_fs.errors import LayoutError, SceneError, together
 from petsc_fs.fields import MECHANICS
 from petsc_fs.nest import Blocks
 from petsc_fs.partition import Layout
-from petsc_fs.fixed_stress import analytic_coefficients as fixed_stress_coefficients
 from petsc_fs.scene import CSR, Scene, csr_rows
 
 Floats = NDArray[np.float64]
 FieldArrays = dict[str, Floats]
 Pair = tuple[str, str]
 
-WEAK = 1e-8
-"""Ratio to the median from which a diagonal entry is next to nothing."""
 ROUNDS = 50
 """Rounds of equilibration between fields, of which there are few."""
 
@@ -34,6 +31,8 @@ ROUNDS = 50
 EPS = 2.0**-52
 ROUNDING_UNITS = 10
 """A residual of so many units of rounding of the terms of its equations cannot be told from zero."""
+SMALL = 1e-6
+"""Relative residual of the equilibrated system from which rounding is no excuse."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +43,13 @@ class Check:
         residual: |b_f - A_f x|.
         terms: | |A_f| |x| + |b_f| |, or a lower bound of it.
         rhs: |b_f|.
+        balanced: |b - A x| / |b| with the rows of the equilibrated system.
     """
 
     residual: Mapping[str, float]
     terms: Mapping[str, float]
     rhs: Mapping[str, float]
+    balanced: float
 
     @property
     def relative(self) -> float:
@@ -62,7 +63,9 @@ class Check:
 
     @property
     def rounding(self) -> float:
-        """What rounding may leave of the residual, relative to |b|."""
+        """What rounding may leave of the residual, relative to |b|; 0 where that is not small, whatever the units."""
+        if self.balanced > SMALL:
+            return 0.0
         return ROUNDING_UNITS * EPS * norm(self.terms) / (norm(self.rhs) or 1.0)
 
     def excess(self, tolerance: float, field_tolerance: float) -> float:
@@ -93,13 +96,13 @@ class System:
         renewals: how often blocks were made anew because their pattern had changed.
     """
 
-    def __init__(self, layout: Layout, *, root_only: bool = False, coordinates: bool = True) -> None:
+    def __init__(self, layout: Layout, *, root_only: bool = False, near_null_space: bool = True) -> None:
         """Nothing is there yet; see `take`. Local.
 
         Args:
             layout: distribution of the rows, without empty fields.
             root_only: whether scenes are on rank 0 alone; otherwise each rank gives its share of their rows.
-            coordinates: whether displacement fields get the coordinates of their cells, for rigid-body modes.
+            near_null_space: whether displacement fields get their rigid-body modes.
         """
         self.layout = layout
         self.root_only = root_only
@@ -110,7 +113,7 @@ class System:
         self.row_scale = dict.fromkeys(layout.fields, 0)
         self.rhs_scale = 0
         self.block_norms: dict[Pair, float] = {}
-        self._coordinates = coordinates
+        self._near_null_space = near_null_space
         self._patterns: dict[Pair, CSR] = {}
         given = Layout.contiguous(layout.comm, layout.dimension, {f: layout.sizes(f)[1] for f in layout.fields})
         self._shares = {f: given.rows(f) for f in layout.fields}
@@ -174,8 +177,7 @@ class System:
                     f"block ({r}, {c}): {block.data.size} entries on a rank; "
                     "use more ranks, or a PETSc with 64-bit indices"
                 )
-        if hasattr(scene, "check_rows"):
-            scene.check_rows()
+        scene.check_rows()
 
     def _bsize(self, r: str, c: str) -> tuple[int, int]:
         return self.layout.block_size(r), self.layout.block_size(c)
@@ -204,7 +206,7 @@ class System:
         """A block from this rank's share of its rows, which is taken out of `given`."""
         comm, block = self.layout.comm, given.pop()
         sizes = tuple((self._shares[f][1] - self._shares[f][0], self.layout.sizes(f)[1]) for f in (r, c))
-        csr = tuple(part.astype(PETSc.IntType, copy=False) for part in block[:2]) + (block.data,)
+        csr = (*(part.astype(PETSc.IntType, copy=False) for part in block[:2]), block.data)
         if comm.size == 1:
             matrix = PETSc.Mat().createAIJWithArrays(sizes, csr, comm=comm)  # in these very arrays
         else:
@@ -236,8 +238,9 @@ class System:
                 self._patterns[rc] = block
                 todo.append((rc, not same))
         todo = self.layout.comm.bcast(todo)
-        for rc in set(self.blocks) - {rc for rc, _ in todo}:
+        for rc in sorted(set(self.blocks) - {rc for rc, _ in todo}):
             self.blocks.pop(rc).destroy()
+            self._patterns.pop(rc, None)
         for rc, changed in todo:
             if changed:
                 if rc in self.blocks:
@@ -277,8 +280,8 @@ class System:
         coefficients, centers = None, {}
         with together(comm):
             if scene is not None:
-                coefficients = fixed_stress_coefficients(scene) if "mass" in fields else None
-                centers = {f: v for f, v in scene.cell_centers.items() if f in MECHANICS} if self._coordinates else {}
+                coefficients = scene.fixed_stress_coefficients() if "mass" in fields else None
+                centers = {f: v for f, v in scene.cell_centers.items() if f in MECHANICS}
         known = comm.bcast((coefficients is not None, sorted(centers)))
         if known[0]:
             for k, name in enumerate(("fixed_stress_base", "fixed_stress_ratio")):
@@ -289,9 +292,8 @@ class System:
             if scene is not None:
                 values = self._share(f, scene, centers[f][:, : self.layout.dimension].ravel())
             self.blocks[f, f].compose("coordinates", self._vector(f, values))
-            modes = nest.rigid_body_modes([self.blocks[f, f]])
-            assert modes is not None
-            self.blocks[f, f].setNearNullSpace(modes)
+            if self._near_null_space and (modes := nest.rigid_body_modes([self.blocks[f, f]])) is not None:
+                self.blocks[f, f].setNearNullSpace(modes)
 
     def _vector(self, name: str, values: Floats | None) -> PETSc.Vec:
         vector = self.blocks[name, name].createVecLeft()
@@ -356,17 +358,11 @@ class System:
                     size = np.abs(product)
                 terms[row] += size
             r.setArray(np.concatenate([*residual.values()]))
-            found = ({f: np.ldexp(v, -self.row_scale[f]) for f, v in part.items()} for part in (residual, terms, rhs))
-            return Check(*(self.norms(part) for part in found))
-
-    def has_weak_pivots(self) -> bool:
-        """Whether preconditioners divide by an entry of J_44 that is next to nothing beside the others. Collective."""
-        if "intf_flow" not in self.layout.fields:
-            return False
-        diagonal = self.blocks["intf_flow", "intf_flow"].getDiagonal()
-        everywhere = np.abs(np.concatenate(self.layout.comm.allgather(diagonal.getArray())))
-        diagonal.destroy()
-        return bool(everywhere.min() < WEAK * np.median(everywhere))
+            given = [
+                self.norms({f: np.ldexp(v, -self.row_scale[f]) for f, v in part.items()})
+                for part in (residual, terms, rhs)
+            ]
+        return Check(given[0], given[1], given[2], r.norm() / (self.b.norm() or 1.0))
 
     def least_sizes(self, check: Check, tolerance: float) -> dict[str, float]:
         """Per field the size below which it changes no equation by more than a tolerance of its terms. Local."""
@@ -376,9 +372,18 @@ class System:
         return {f: tolerance * min(found, default=0.0) for f, found in limits.items()}
 
     def norms(self, arrays: Mapping[str, Floats]) -> dict[str, float]:
-        """Euclidean norm of each field over all ranks. Collective."""
-        squares = np.array([np.vdot(arrays[f], arrays[f]) for f in self.layout.fields])
-        return dict(zip(self.layout.fields, np.sqrt(self.layout.comm.allreduce(squares)).tolist(), strict=True))
+        """Euclidean norm of each field over all ranks, also where squares overflow or vanish. Collective."""
+        comm, parts = self.layout.comm, [arrays[f] for f in self.layout.fields]
+        exponents = np.zeros(len(parts), dtype=int)
+        with np.errstate(over="ignore", under="ignore"):
+            squares = comm.allreduce(np.array([np.vdot(v, v) for v in parts]))
+            if not all(1e-280 < s < 1e280 for s in squares):
+                largest = np.array([np.abs(v).max(initial=0.0) for v in parts])
+                comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
+                exponents = np.frexp(largest)[1]
+                parts = [np.ldexp(v, -e) for v, e in zip(parts, exponents, strict=True)]
+                squares = comm.allreduce(np.array([np.vdot(v, v) for v in parts]))
+        return dict(zip(self.layout.fields, np.ldexp(np.sqrt(squares), exponents).tolist(), strict=True))
 
     def gather(self, arrays: Mapping[str, Floats]) -> FieldArrays | None:
         """All rows of each field in the scene's numbering, on rank 0; None elsewhere. Collective."""

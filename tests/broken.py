@@ -1,8 +1,8 @@
 """Broken input: strategies that draw scenes and options files with things wrong, and what becomes of them.
 
-As a program, `python tests/broken.py COUNT [-n RANKS]` draws so many in processes of their own and prints how they
-ended, by what was wrong; exit code 1 if one crashed, hung, raised anything but one clear error, left a half-written
-file, or was answered by numbers that are not finite. `--seed S` draws others.
+As a program, `python tests/broken.py COUNT` draws so many in processes of their own and prints how they ended, by what
+was wrong; exit code 1 if one crashed, hung, raised anything but one clear error, left a half-written file, or was
+answered by numbers that are not finite. `--two COUNT` tries more on two ranks, `--seed S` draws others.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class Damage:
     """One thing that is wrong with a scene's file.
 
     Attributes:
-        kind: "array", "block", "attribute", "lost", "link", "bits", "cut" or "none".
+        kind: "array", "block", "attribute", "lost", "link", "hidden", "bits", "cut" or "none".
         place: which dataset, group or byte, as a fraction of all.
         way: what is done to it.
         at: which entry of it, as a fraction.
@@ -137,6 +137,9 @@ kinds = {
         Damage, st.just("lost"), fractions, st.sampled_from(("dataset", "group", "attribute")), fractions
     ),
     "link": st.builds(Damage, st.just("link"), fractions, st.sampled_from(("outside", "itself", "other"))),
+    "hidden": st.builds(
+        Damage, st.just("hidden"), fractions, st.sampled_from(("virtual", "external", "unwritten", "half"))
+    ),
     "bits": st.builds(Damage, st.just("bits"), fractions, st.integers(0, 7)),
     "cut": st.builds(Damage, st.just("cut"), fractions, st.integers(0, 2)),
 }
@@ -221,7 +224,7 @@ def hurt(path: Path, damage: Damage) -> None:
         hurt_inside(file, damage)
 
 
-def hurt_inside(file: h5py.File, damage: Damage) -> None:
+def hurt_inside(file: h5py.File, damage: Damage) -> None:  # noqa: PLR0911
     """Do one thing to what a scene's file holds."""
     kind, way = damage.kind, damage.way
     if kind == "block":
@@ -250,11 +253,29 @@ def hurt_inside(file: h5py.File, damage: Damage) -> None:
         del file[name]
         file[name] = twisted
         return None
+    if kind == "hidden":
+        return hide(file, name, way)
     del file[name]
     if kind == "link":
         links = {"outside": h5py.ExternalLink("nowhere.h5", "x"), "itself": h5py.SoftLink("/" + name)}
         file[name] = links.get(way, h5py.SoftLink("/" + pick(names, damage.at)))
     return None
+
+
+def hide(file: h5py.File, name: str, way: str) -> None:
+    """Put the numbers of a dataset into a file that is not there, or do not write all of them."""
+    values = np.array(file[name][()])
+    del file[name]
+    if way == "virtual":
+        layout = h5py.VirtualLayout(values.shape, values.dtype)
+        layout[...] = h5py.VirtualSource("nowhere.h5", "x", values.shape)
+        file.create_virtual_dataset(name, layout)
+    elif way == "external":
+        file.create_dataset(name, values.shape, values.dtype, external=[("nowhere.raw", 0, values.nbytes)])
+    else:
+        dataset = file.create_dataset(name, values.shape, values.dtype, chunks=(1,) * values.ndim)
+        if way == "half":
+            dataset[: len(values) // 2] = values[: len(values) // 2]
 
 
 def hurt_block(file: h5py.File, damage: Damage) -> None:
@@ -372,9 +393,6 @@ def attempt(broken: Broken, comm: MPI.Intracomm) -> str:
 
 def use(path: Path, file: Path | None, comm: MPI.Intracomm) -> str:
     """Read a scene, solve it and write what came out, as `petsc-fs solve` does. Collective."""
-    from petsc4py import PETSc
-
-    from petsc_fs.cli.main import tree_for
     from petsc_fs.io.reader import read_distributed
     from petsc_fs.solver import Solver
 
@@ -383,9 +401,7 @@ def use(path: Path, file: Path | None, comm: MPI.Intracomm) -> str:
         if file is not None:
             options.read_header(file)
             new = options.insert_all(options.parse(file))
-        scene, layout = read_distributed(path, comm, index_type=PETSc.IntType)
-        if file is None:
-            new = options.insert_all(tree_for(scene, comm).options)
+        scene, layout = read_distributed(path, comm)
         solver = Solver(scene, comm, layout=layout)
         try:
             result = solver.solve()
@@ -459,106 +475,67 @@ def main() -> int:
     """Run as a program."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("count", type=int, nargs="?", default=1000)
-    parser.add_argument("-n", "--ranks", type=int, default=1)
+    parser.add_argument("--two", type=int, default=0, metavar="COUNT", help="so many more on two ranks")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--report", type=Path, metavar="FILE.json", help="write the counts")
-    parser.add_argument("--read", type=Path, nargs="+", metavar="FILE.json", help="read reports instead of trying")
-    parser.add_argument("--page", type=Path, metavar="FILE.md", help="write the counts as a page")
+    parser.add_argument("--page", type=Path, metavar="FILE.md", help="write the counts as a page, too")
     parser.add_argument("--child", nargs=3, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.child:
         child(int(args.child[0]), int(args.child[1]), Path(args.child[2]))
         return 0
-    if args.read:
-        runs = [json.loads(path.read_text(encoding="utf-8")) for path in args.read]
-    else:
-        runs = [try_all(args.count, args.ranks, args.seed)]
-    if args.report:
-        write_text(args.report, json.dumps(runs[0], indent=1) + "\n")
+    runs = {ranks: try_all(count, ranks, args.seed) for ranks, count in ((1, args.count), (2, args.two)) if count}
+    text = "\n".join(page(runs)) + "\n"
+    print(text)
     if args.page:
-        write_text(args.page, "\n".join(page(runs)) + "\n")
-    return 1 if any(run["counts"].get(o) for run in runs for o in BAD) else 0
+        write_text(args.page, text)
+    return 1 if any(outcome.partition(":")[0] in BAD for run in runs.values() for outcome, _, _ in run) else 0
 
 
-def try_all(count: int, ranks: int, seed: int) -> dict[str, Any]:
-    """Try so many inputs; the counts, and what came of what."""
-    counts: Counter[str] = Counter()
-    by_kind: dict[str, Counter[str]] = {}
-    bad: list[str] = []
-    started, first = time.monotonic(), seed
-    while (left := count - counts.total()) > 0:
+def try_all(count: int, ranks: int, seed: int) -> list[tuple[str, str, str]]:
+    """Try so many inputs: how each ended, what was wrong, and the input."""
+    found: list[tuple[str, str, str]] = []
+    while (left := count - len(found)) > 0:
         with tempfile.TemporaryDirectory() as folder:
             log = Path(folder) / "log"
             ended = run_child(seed, min(BATCH, left), ranks, log)
             text = log.read_text(encoding="utf-8")
         lines = [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
-        seed += 1
         last: list[str] = []
         for words in lines:
-            if words[0] == "started":
-                last = words
-                continue
-            bad += note(words[0], last, counts, by_kind)
-            last = []
-        if ended and last:
-            bad += note(ended, last, counts, by_kind)
-        elif ended or not lines:
-            print(f"seed {seed - 1}: {ended or 'nothing was drawn'}", flush=True)
-            counts[(ended or "crash").partition(":")[0]] += 1
-            break
-    report(counts, by_kind, time.monotonic() - started)
-    return {"ranks": ranks, "seed": first, "counts": counts, "by_kind": by_kind, "bad": bad}
+            if words[0] != "started":
+                found.append((words[0], last[2], last[1]))
+            last = words if words[0] == "started" else []
+        if ended or not lines:
+            found.append((ended or "crash: nothing was drawn", *(last[:0:-1] or ["none", f"seed {seed}"])))
+            if not last:
+                break
+        seed += 1
+    return found
 
 
-def page(runs: list[dict[str, Any]]) -> list[str]:
+def page(runs: dict[int, list[tuple[str, str, str]]]) -> list[str]:
     """The counts in Markdown."""
     lines = [
         "# Broken input",
         "",
-        "Written by `python tests/broken.py COUNT --page`: small scenes with random fields, some of size 0 or 1, with",
-        "up to three things wrong with their files, and options files with up to three edits, drawn by hypothesis and",
-        "used as by `petsc-fs solve`. Where damage leaves another, sound system, an answer is what should come.",
+        "Written by `python tests/broken.py COUNT --two COUNT --page FILE`: small scenes with random fields, some of",
+        "size 0 or 1, with up to three things wrong with their files, and options files with up to three edits, drawn",
+        "by hypothesis and used as by `petsc-fs solve`. Where damage leaves another, sound system, an answer should",
+        "come. In the tables an input with several damages counts with each.",
         "",
         *("- **" + name + "**: " + words for name, words in MEANING.items()),
-        "",
-        "| ranks | inputs | " + " | ".join((*GOOD, *BAD)) + " |",
-        "| --- " * (len(GOOD) + len(BAD) + 2) + "|",
     ]
-    for run in runs:
-        found = Counter(run["counts"])
-        numbers = " | ".join(str(found[o]) for o in (*GOOD, *BAD))
-        lines.append(f"| {run['ranks']} | {found.total()} | {numbers} |")
-    for run in runs:
-        outcomes = [*GOOD, *(o for o in BAD if run["counts"].get(o))]
-        lines += ["", f"## What was wrong, {run['ranks']} rank{'s' if run['ranks'] > 1 else ''}", ""]
-        lines += ["An input with several damages counts with each.", ""]
-        lines += ["| what | " + " | ".join(outcomes) + " |", "| --- " * (len(outcomes) + 1) + "|"]
-        for kind, found in sorted(run["by_kind"].items()):
-            lines.append(f"| {kind} | " + " | ".join(str(found.get(o, 0)) for o in outcomes) + " |")
-        lines += [f"\n{text}" for text in run["bad"]]
+    for ranks, run in runs.items():
+        counts = Counter(outcome.partition(":")[0] for outcome, _, _ in run)
+        outcomes = [*GOOD, *(o for o in BAD if counts[o])]
+        by_kind = Counter((part, o.partition(":")[0]) for o, kinds, _ in run for part in kinds.split(" + "))
+        lines += ["", f"## {len(run)} inputs on {ranks} rank{'s' if ranks > 1 else ''}", ""]
+        lines += ["| what is wrong | " + " | ".join(outcomes) + " |", "| --- " * (len(outcomes) + 1) + "|"]
+        for kind in sorted({kind for kind, _ in by_kind}):
+            lines.append(f"| {kind} | " + " | ".join(str(by_kind[kind, o]) for o in outcomes) + " |")
+        lines.append("| **all** | " + " | ".join(str(counts[o]) for o in outcomes) + " |")
+        lines += [f"\n{outcome}: `{what}`" for outcome, _, what in run if outcome.partition(":")[0] in BAD]
     return lines
-
-
-def note(outcome: str, started: list[str], counts: Counter[str], by_kind: dict[str, Counter[str]]) -> list[str]:
-    """Count an outcome; a bad one with what it came of, printed and returned."""
-    kind = outcome.partition(":")[0]
-    counts[kind] += 1
-    for part in started[2].split(" + "):
-        by_kind.setdefault(part, Counter())[kind] += 1
-    if kind not in BAD:
-        return []
-    print(f"{outcome}\n  {started[1]}", flush=True)
-    return [f"{outcome}: `{started[1]}`"]
-
-
-def report(counts: Counter[str], by_kind: dict[str, Counter[str]], seconds: float) -> None:
-    """Print how many ended how, by what was wrong."""
-    outcomes = [*GOOD, *(o for o in BAD if counts[o])]
-    print(f"{'what is wrong':24}" + "".join(f"{o:>16}" for o in outcomes))
-    for kind, found in sorted(by_kind.items()):
-        print(f"{kind:24}" + "".join(f"{found[o]:16}" for o in outcomes))
-    words = ", ".join(f"{counts[o]} {o}" for o in (*GOOD, *BAD))
-    print(f"{words} of {counts.total()}, {seconds:.0f} s")
 
 
 if __name__ == "__main__":

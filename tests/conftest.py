@@ -18,6 +18,7 @@ from _pytest.runner import runtestprotocol
 from mpi4py import MPI
 
 petsc4py.init([])
+pytest.register_assert_rewrite("common")
 
 GRACE = 30
 LIMIT = 300
@@ -123,3 +124,17 @@ def clean():
     for name in database.getAll():
         if name not in before:
             database.delValue(name)
+
+
+@pytest.fixture
+def database(clean):
+    """Puts options, and those of a file besides, into the database; all of them are gone after the test."""
+    from petsc_fs import options
+
+    def insert(file: str | None = None, **more: str) -> None:
+        for name, value in more.items():
+            clean.setValue(name, value)
+        if file is not None:
+            options.insert(options.find_options_file(file))
+
+    return insert

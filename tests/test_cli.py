@@ -1,6 +1,7 @@
 """The command line as a user meets it: exit codes, one clear line per error, whole files or none.
 
-Every command runs in a process of its own, on one rank and on two, with a limit of time: a hang is a failure.
+Commands run in processes of their own, on one rank and on two, with a limit of time: a hang is a failure. Errors on one
+rank are provoked in this process.
 """
 
 import importlib.util
@@ -9,6 +10,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 import h5py
@@ -18,9 +20,10 @@ from sample import SCENES
 
 import petsc_fs
 from petsc_fs import options
-from petsc_fs.cli.main import find_scene, split_arguments
-from petsc_fs.errors import SceneError
+from petsc_fs.cli.main import main, split_arguments
+from petsc_fs.errors import SceneError, UsageError
 from petsc_fs.io import hdf5
+from petsc_fs.io.bundled import check_targets, find_scene
 from petsc_fs.scene import contact_state_counts
 
 MPIEXEC = Path(petsc_fs.__path__[0]).parent / "scripts" / "mpiexec"
@@ -32,12 +35,27 @@ ENVIRONMENT = dict(os.environ, OMP_NUM_THREADS="1")
 Done = subprocess.CompletedProcess[str]
 
 
-def run(*arguments: object, cwd: Path, ranks: int = 1) -> Done:
+def run(*arguments: object, cwd: Path, ranks: int = 1, environment: Mapping[str, str] | None = None) -> Done:
     """`petsc-fs` with these arguments in a folder."""
     command = [sys.executable, "-m", "petsc_fs", *map(str, arguments)]
     if ranks > 1:
         command = [str(MPIEXEC), "-n", str(ranks), *command]
-    return subprocess.run(command, cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=LIMIT, check=False)
+    everything = ENVIRONMENT | dict(environment or {})
+    return subprocess.run(
+        command, cwd=cwd, env=everything, capture_output=True, text=True, errors="replace", timeout=LIMIT, check=False
+    )
+
+
+@pytest.fixture
+def here(tmp_path, clean, monkeypatch, capsys):
+    """The working directory, and `petsc-fs` in this process."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(arguments: list[str]) -> Done:
+        code = main(arguments)
+        return Done(arguments, code, *capsys.readouterr())
+
+    return tmp_path, call
 
 
 def ours(done: Done, ranks: int) -> list[str]:
@@ -66,6 +84,8 @@ def wrong(tmp_path_factory) -> Path:
         file.attrs["encoding-version"] = 2
     (folder / "syntax.opts").write_text("# mine\n-ksp_type gmres\nksp_rtol 1e-8\n")
     (folder / "binary.opts").write_bytes(whole[:500])
+    (folder / "self.opts").write_text("-options_file self.opts\n")
+    os.mkfifo(folder / "pipe.h5")
     return folder
 
 
@@ -112,7 +132,16 @@ FAILURES = {
         ["solve", "flow.h5", "-options_file", "syntax.opts"],
         ["syntax.opts:3: 'ksp_rtol' is not an option; options start with '-'"],
     ),
-    "options_file_without_name": (2, ["solve", "flow.h5", "-options_file"], ["name of the file is missing"]),
+    "options_file_without_name": (2, ["solve", "flow.h5", "-options_file"], ["-options_file without the name"]),
+    "options_file_that_includes_itself": (2, ["solve", "flow.h5", "-options_file", "self.opts"], ["includes itself"]),
+    "value_that_is_no_number": (
+        2,
+        ["solve", "flow.h5", "-ksp_rtol", "nan"],
+        ["-ksp_rtol nan: expected a number from 0"],
+    ),
+    "missing_value": (2, ["solve", "-ksp_rtol", "flow.h5"], ["-ksp_rtol without a value"]),
+    "stray_word": (2, ["solve", "flow.h5", "-ksp_rtol", "1e-10", "5"], ["unrecognized arguments: 5"]),
+    "equals": (2, ["solve", "flow.h5", "-ksp_rtol=1e-3"], ["-ksp_rtol=1e-3: a space, no '='"]),
     "options_file_for_other_fields": (
         2,
         ["solve", "flow.h5", "-options_file", "poromechanics.opts"],
@@ -130,10 +159,10 @@ FAILURES = {
     ),
     "impossible_value": (
         2,
-        ["solve", "flow.h5", "-petsc_fs_mat_type", "foo"],
-        ["-petsc_fs_mat_type foo: expected nest or "],
+        ["solve", "flow.h5", "-petsc_fs_partition", "foo"],
+        ["-petsc_fs_partition foo: expected auto or "],
     ),
-    "wrong_subcommand": (2, ["slove", "flow.h5"], ["invalid choice: 'slove' (choose from 'solve', "]),
+    "wrong_subcommand": (2, ["slove", "flow.h5"], ["invalid choice: 'slove' (choose from "]),
     "no_scene": (2, ["solve"], ["the following arguments are required: SCENE"]),
     "petsc_option_elsewhere": (2, ["inspect", "flow.h5", "-ksp_view"], ["-ksp_view: PETSc options go with solve"]),
     "report_into_missing_folder": (
@@ -141,24 +170,26 @@ FAILURES = {
         ["solve", "flow.h5", "--report", "nowhere/report.json"],
         ["nowhere/report.json: the folder", "does not exist"],
     ),
-    "report_over_a_folder": (2, ["solve", "flow.h5", "--report", "folder"], ["folder: cannot be written"]),
-    "save_over_a_folder": (2, ["solve", "flow.h5", "--save", "folder"], ["folder: cannot be written"]),
+    "save_over_a_folder": (2, ["solve", "flow.h5", "--save", "folder"], ["folder: cannot be written: it is a folder"]),
+    "pipe": (3, ["solve", "pipe.h5"], ["pipe.h5: a pipe or device, not a scene"]),
 }
 
 
 ON_TWO_RANKS = (
     *("missing_scene", "truncated_scene", "nan", "short_field", "singular_D22", "inspect_nan"),
     *("missing_options_file", "options_file_with_syntax_error", "options_file_for_other_fields", "misspelt_option"),
-    *("wrong_subcommand", "report_into_missing_folder", "save_over_a_folder", "options_nan"),
+    *("wrong_subcommand", "report_into_missing_folder", "save_over_a_folder", "options_nan", "misspelt_own_option"),
+    *("value_that_is_no_number", "stray_word"),
 )
 CASES = [(name, 1) for name in FAILURES] + [(name, 2) for name in ON_TWO_RANKS]
 
 
 @pytest.mark.parametrize(("name", "ranks"), CASES, ids=[f"{name}-{ranks}" for name, ranks in CASES])
-def test_an_error_is_one_clear_line_and_leaves_no_file(wrong, tmp_path, name, ranks):
+def test_an_error_is_one_clear_line_and_leaves_no_file(wrong, here, name, ranks):
+    tmp_path, call = here
     code, arguments, fragments = FAILURES[name]
     for word in arguments:
-        if (wrong / word).is_file():
+        if (wrong / word).is_file() or (wrong / word).is_fifo():
             (tmp_path / word).symlink_to(wrong / word)
     (tmp_path / "folder").mkdir()
     before = sorted(p.name for p in tmp_path.rglob("*"))
@@ -166,7 +197,7 @@ def test_an_error_is_one_clear_line_and_leaves_no_file(wrong, tmp_path, name, ra
         extra = {"--report": "report.json", "--save": "solution.h5"}
         order = [w for k, v in extra.items() if k not in arguments for w in (k, v)]
         arguments = ["solve", *order, *arguments[1:]] if "folder" not in arguments else arguments
-    done = run(*arguments, cwd=tmp_path, ranks=ranks)
+    done = run(*arguments, cwd=tmp_path, ranks=ranks) if ranks > 1 else call(arguments)
     lines = ours(done, ranks)
     assert [line.startswith("petsc-fs: ") for line in lines] == [True], done.stderr
     assert all(text in lines[0] for text in fragments), lines[0]
@@ -188,25 +219,19 @@ def test_several_unused_options_are_all_named(tmp_path):
 def test_a_solve_that_stops_early_is_reported_and_exits_1(tmp_path, ranks):
     done = run("solve", "biot.h5", "-ksp_max_it", 2, "--report", "r.json", cwd=tmp_path, ranks=ranks)
     assert (done.returncode, ours(done, ranks)) == (1, [])
-    assert "NOT CONVERGED" in done.stdout
+    assert "not converged" in done.stdout.lower()
     report = json.loads((tmp_path / "r.json").read_text())
     assert (report["converged"], report["iterations"], report["reason"]) == (False, 2, "DIVERGED_MAX_IT")
     assert report["true_relative_residual"] > report["tolerance"]
 
 
-@pytest.mark.parametrize("ranks", [1, 2], ids=["1_rank", "2_ranks"])
-def test_a_fallback_is_told_and_hides_no_misspelt_option(tmp_path, ranks):
-    words = ["solve", "flow.h5", "-ksp_max_it", "2", "-petsc_fs_fallback", "direct_mechanics,monolithic"]
-    done = run(*words, "--report", "report.json", cwd=tmp_path, ranks=ranks)
-    assert done.returncode == 0, done.stderr
-    assert "fallback direct_mechanics: no level that it could strengthen, skipped" in done.stdout
-    assert "fallback monolithic on the whole system: " in done.stdout
-    report = json.loads((tmp_path / "report.json").read_text())
-    assert report["fallback"] == "monolithic"
-    assert "pc_factor_mat_solver_type" not in report["options"]
-    done = run(*words, MISSPELT, "0.5", cwd=tmp_path, ranks=ranks)
-    assert done.returncode == 2
-    assert [line for line in ours(done, ranks) if MISSPELT in line]
+def test_the_preconditioner_alone_is_judged_like_any_solver(here):
+    _, call = here
+    done = call(["solve", "flow.h5", "-ksp_type", "preonly", "--report", "r.json"])
+    report = json.loads(Path("r.json").read_text())
+    assert (done.returncode, report["converged"], report["iterations"]) == (1, False, 1)
+    assert report["true_relative_residual"] > report["tolerance"]
+    assert "not converged" in done.stdout.lower()
 
 
 @pytest.mark.parametrize("ranks", [1, 2], ids=["1_rank", "2_ranks"])
@@ -237,6 +262,9 @@ def test_the_report_says_what_was_done_and_how_well(tmp_path, ranks):
     assert report["left_out"] == []
     assert {"petsc_fs", "petsc", "hdf5", "python", "numpy"} <= set(report["versions"])
     assert f"{report['iterations']} iterations" in done.stdout
+    assert report["verdict"] in " ".join(done.stdout.split())
+    assert done.stdout.isascii()
+    assert max(map(len, done.stdout.splitlines())) <= 80
     assert all(f in done.stdout for f in scene.fields)
 
 
@@ -270,7 +298,7 @@ def test_own_options_files_are_taken_beside_shipped_ones(tmp_path):
     ("arguments", "words"),
     [
         (["--help"], ["solve", "inspect", "convert", "export", "two dashes"]),
-        (["solve", "-h"], ["--report", "--save", "-options_file", "exit codes: 0 ", "1 it does not", "3 a scene"]),
+        (["solve", "-h"], ["--report", "--save", "-options_file", "exit codes: 0 ", "1 not converged", "3 a scene"]),
         (["inspect", "--help"], ["SCENE", "--plot"]),
         (["convert", "--help"], ["SOURCE", "TARGET", "matrix.petsc", "--dimension"]),
         (["export", "--help"], ["--steps", "--out"]),
@@ -293,7 +321,8 @@ def test_inspect_shows_fields_and_contact_states_once(tmp_path, ranks):
     done = run("inspect", "model2.h5", cwd=tmp_path, ranks=ranks)
     assert (done.returncode, done.stderr) == (0, "")
     scene = hdf5.read(SCENES / "model2.h5")
-    rows = [line.replace("│", " ").split() for line in done.stdout.splitlines()]
+    rows = [line.split() for line in done.stdout.splitlines()]
+    assert max(map(len, done.stdout.splitlines())) <= 80
     for f, size in scene.sizes.items():
         assert sum(row[:1] == [f] and f"{size:,}" in row for row in rows) >= 1
         entries = [f"{scene.blocks[f, c].data.size:,}" if (f, c) in scene.blocks else "." for c in scene.fields]
@@ -304,16 +333,94 @@ def test_inspect_shows_fields_and_contact_states_once(tmp_path, ranks):
     assert "porepy 1.11" in done.stdout
 
 
-def test_inspect_may_be_cut_off_by_a_pipe(tmp_path):
+@pytest.mark.parametrize("words", [["inspect", "flow.h5"], ["solve", "flow.h5", "-ksp_monitor"], ["--help"]], ids=str)
+def test_output_that_nobody_reads_ends_with_a_line(tmp_path, words):
     process = subprocess.Popen(
-        [sys.executable, "-m", "petsc_fs", "inspect", "flow.h5"],
+        [sys.executable, "-m", "petsc_fs", *words],
         cwd=tmp_path,
         env=ENVIRONMENT,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
+        text=True,
     )
     process.stdout.close()
-    assert (process.stderr.read(), process.wait(LIMIT)) == (b"", 0)
+    errors = process.stderr.read()
+    assert (errors, process.wait(LIMIT)) == ("petsc-fs: standard output was closed before all was written\n", 141)
+
+
+BROKEN_PCS = """
+import sys
+import numpy as np
+
+class Value:
+    def setUp(self, pc): raise ValueError("two\\nlines")
+
+class Apply:
+    def apply(self, pc, x, y): raise ValueError("in apply")
+
+class Exit:
+    def setUp(self, pc): sys.exit(0)
+
+class Memory:
+    def setUp(self, pc): self.much = np.empty(2**45)
+
+class OneRank:
+    def apply(self, pc, x, y):
+        if pc.comm.rank == pc.comm.size - 1: raise ValueError("here only")
+        pc.comm.tompi4py().barrier()
+"""
+
+
+@pytest.mark.parametrize("ranks", [1, 2], ids=["1_rank", "2_ranks"])
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [
+        ("Value", "ValueError: two lines"),
+        ("Apply", "ValueError: in apply"),
+        ("Exit", "SystemExit: 0"),
+        ("Memory", "out of memory: Unable to allocate"),
+        ("OneRank", "ValueError: here only"),
+    ],
+)
+def test_a_python_pc_that_fails_is_one_clear_line(tmp_path, kind, expected, ranks):
+    (tmp_path / "broken_pcs.py").write_text(BROKEN_PCS)
+    options = ["-pc_type", "python", "-pc_python_type", f"broken_pcs.{kind}"]
+    done = run("solve", "flow.h5", *options, cwd=tmp_path, ranks=ranks)
+    lines = [line for line in done.stderr.splitlines() if line.startswith("petsc-fs: ")]
+    assert [expected in line for line in lines] == [True], done.stderr
+    assert "Traceback" not in done.stderr
+    assert (done.returncode, done.stdout) == (1, "")
+
+
+def test_options_of_other_programs_in_the_environment_are_only_told(tmp_path):
+    environment = {"PETSC_OPTIONS": "-snes_monitor -mat_type aij"}
+    done = run("solve", "flow.h5", cwd=tmp_path, environment=environment)
+    assert done.returncode == 0
+    assert done.stderr.startswith("petsc-fs: warning: 2 options were not used:\n  option -mat_type from PETSC_OPTIONS")
+    done = run("solve", "flow.h5", "-snes_monitor", cwd=tmp_path, environment=environment)
+    assert done.returncode == 2
+    assert done.stderr == "petsc-fs: option -snes_monitor from the command line was not used\n"
+    assert run("solve", "flow.h5", cwd=tmp_path, environment={"PETSC_OPTIONS": "-ksp_rtol nan"}).returncode == 2
+
+
+def test_the_petscrc_of_a_folder_is_read_only_where_it_is_asked_for(tmp_path):
+    (tmp_path / ".petscrc").write_text("-ksp_max_it 1\n")
+    assert run("solve", "flow.h5", cwd=tmp_path).returncode == 0
+    assert run("solve", "flow.h5", "--petscrc", cwd=tmp_path).returncode == 1
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_any_terminal_will_do(tmp_path, encoding):
+    (tmp_path / "größe 中.h5").symlink_to(SCENES / "flow.h5")
+    words = [["solve", "größe 中.h5"], ["inspect", "model1.h5", "--contraction"]]
+    for done in (run(*w, cwd=tmp_path, environment={"PYTHONIOENCODING": encoding}) for w in words):
+        assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_decimal_comma_of_the_program_does_not_matter(tmp_path):
+    program = "import locale; locale.setlocale(locale.LC_ALL, ''); from petsc_fs.cli.main import main; "
+    program += "assert main(['solve', 'flow.h5']) == 0; assert locale.localeconv()['decimal_point'] == '.'"
+    subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=ENVIRONMENT, check=True, timeout=LIMIT)
 
 
 needs_matplotlib = pytest.mark.skipif(importlib.util.find_spec("matplotlib") is None, reason="no matplotlib")
@@ -334,7 +441,7 @@ def test_inspect_draws_a_picture(tmp_path):
 def test_a_picture_that_cannot_be_drawn_is_an_error(tmp_path, target):
     done = run("inspect", "flow.h5", "--plot", target, cwd=tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
-    assert done.stderr.startswith(f"petsc-fs: {target}: cannot be drawn: ")
+    assert done.stderr.startswith(f"petsc-fs: {target}: {'the folder' if '/' in target else 'cannot be drawn: '}")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -365,7 +472,12 @@ def test_export_without_porepy_says_how_to_get_it(tmp_path):
     [
         ("solve a.h5", "solve a.h5", ""),
         ("solve a.h5 -ksp_view -ksp_rtol 1e-3", "solve a.h5", "-ksp_view -ksp_rtol 1e-3"),
-        ("solve a.h5 -s -1 -2.5e3 x --save b.h5", "solve a.h5 --save b.h5", "-s -1 -2.5e3 x"),
+        ("solve a.h5 -s -1 -2.5e3 x --save b.h5", "solve a.h5 -2.5e3 x --save b.h5", "-s -1"),
+        ("solve -ksp_view a.h5", "solve a.h5", "-ksp_view"),
+        ("solve -ksp_view hdf5:a.h5 a.h5", "solve a.h5", "-ksp_view hdf5:a.h5"),
+        ("solve a.h5 -options_file b.h5 -petsc_fs_retry c.h5", "solve a.h5", "-options_file b.h5 -petsc_fs_retry c.h5"),
+        ("solve -ksp_rtol 1e-3 a.h5", "solve a.h5", "-ksp_rtol 1e-3"),
+        ("solve a.h5 -info -inf", "solve a.h5", "-info -inf"),
         ("solve --save b.h5 a.h5 -k", "solve --save b.h5 a.h5", "-k"),
         ("solve -k 3 --report=r.json", "solve --report=r.json", "-k 3"),
         ("solve -k 3 -h", "solve -h", "-k 3"),
@@ -378,8 +490,36 @@ def test_one_dash_is_petscs_and_two_are_ours(words, own, petsc):
 def test_a_scene_is_found_by_path_or_by_bundled_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert find_scene("flow.h5") == SCENES / "flow.h5"
+    assert find_scene("model2_run.h5") == SCENES.parent / "sequences" / "model2_run.h5"
     assert find_scene(str(SCENES / "flow.h5")) == SCENES / "flow.h5"
     Path("flow.h5").write_text("mine")
     assert find_scene("flow.h5") == Path("flow.h5")
     with pytest.raises(SceneError, match=r"nowhere/flow\.h5: no such file; bundled scenes are biot\.h5, "):
         find_scene("nowhere/flow.h5")
+
+
+def test_an_existing_scene_of_any_name_is_no_value(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("mine").symlink_to(SCENES / "flow.h5")
+    Path("lu").write_text("no scene")
+    assert split_arguments(["solve", "-ksp_view", "mine"]) == (["solve", "mine"], ["-ksp_view"])
+    assert split_arguments(["solve", "-pc_type", "lu"]) == (["solve"], ["-pc_type", "lu"])
+
+
+def test_nothing_that_is_read_or_asked_for_twice_is_written_over(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scene, link = Path("scene.h5"), Path("link.h5")
+    scene.write_text("")
+    link.symlink_to(scene)
+    check_targets(None, Path("a"), tmp_path / "b", link.parent / "scene.json", sources=[scene])
+    for targets, message in (
+        ((scene,), "scene.h5: cannot be written: it is what is read, and would be lost"),
+        ((link,), "link.h5: cannot be written: it is what is read, and would be lost"),
+        ((Path("a"), None, tmp_path / "a"), "a: cannot be written: it is asked for twice"),
+        ((Path("nowhere/a"),), "nowhere/a: the folder .* does not exist"),
+        ((tmp_path,), "cannot be written: it is a folder"),
+        ((Path("x" * 256),), "cannot be written: it has too long a name"),
+        *(((Path(name),), "pipe or device") for name in ("/dev/null", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1")),
+    ):
+        with pytest.raises(UsageError, match=message):
+            check_targets(*targets, sources=[scene])

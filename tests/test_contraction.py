@@ -9,7 +9,6 @@ from sample import SCENES, csr, dense
 
 from petsc_fs.cli.main import main
 from petsc_fs.errors import SceneError
-from petsc_fs.fixed_stress import analytic_coefficients
 from petsc_fs.io import hdf5
 from petsc_fs.scene import CSR, Material, Scene
 from petsc_fs.tools.contraction import contact_rows, contraction_rate, coupling_term, evaluate, korn_trace
@@ -246,7 +245,7 @@ def richardson(scene, iterations):
     volume = scene.cell_volumes["mass"]
     scale = volume * rho / scene.material.time_step
     rock, fracture = (scene.cell_dimension == scene.dimension - i for i in (0, 1))
-    fixed = analytic_coefficients(scene)[:, 0]  # gamma_c in fractures
+    fixed = scene.fixed_stress_coefficients()[:, 0]  # gamma_c in fractures
     S = J[k:, k:].copy()
     S[range(-cells, 0), range(-cells, 0)] += np.where(rock, alpha**2 / lame * scale, fixed)
     solve_mechanics, solve_flow = direct(J[:k, :k]), direct(S)
@@ -362,32 +361,6 @@ def run_to(name, step, look=None, scenes=None, **changes):
 
     run(make_model(name, **changes), on_newton_step=hook, linear_solve=lambda model: solve(*model.linear_system))
     return found
-
-
-def test_study_compares_orders_and_iterations():
-    pytest.importorskip("scipy", reason="SciPy comes with PorePy")
-    from petsc_fs.porepy.contraction_study import NAMES, System, page, rank_correlation
-
-    def system(stiffness, friction, iterations, opened):
-        normal = None if stiffness == 0 else stiffness
-        theorem = {"coupling": 1.0, "normal": normal, "mismatch": 0.0, "friction": normal and friction * normal}
-        return System(iterations, opened, theorem, (1.0, 2.0), "fails", 0.0, 0.0)
-
-    def study(iterations):
-        from petsc_fs.porepy.parity import RUNS
-
-        parameters = {n: RUNS[n].parameters for n in NAMES}
-        return {
-            n: [system(p.normal_stiffness, p.friction, iterations(p), k) for k in (0, 1)] for n, p in parameters.items()
-        }
-
-    with_friction = page(study(lambda p: round(100 * p.friction)), {"PorePy": "1"})
-    assert "| K_n = 1.2e+09 | F = 0.1, F = 0.577, F = 0.8 | 10.00, 58.00, 80.00 | yes |" in with_friction
-    against = page(study(lambda p: round(100 - 100 * p.friction)), {"PorePy": "1"})
-    assert "| K_n = 1.2e+09 | F = 0.1, F = 0.577, F = 0.8 | 90.00, 42.00, 20.00 | no |" in against
-    assert "fails at 18 of 18 systems" in against
-    assert rank_correlation([1, 2, 4, np.inf], [1, 3, 5, 9]) == pytest.approx(1)
-    assert np.isnan(rank_correlation([1, 1], [1, 2]))
 
 
 def test_grids_that_do_not_match_are_refused():

@@ -2,6 +2,10 @@
 
 import os
 import shutil
+import socket
+import subprocess
+import sys
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +18,7 @@ from sample import SCENES, assert_same, full_scene
 from petsc_fs.errors import LayoutError, SceneError, UsageError
 from petsc_fs.io import hdf5
 from petsc_fs.partition import Layout
-from petsc_fs.scene import Scene
+from petsc_fs.scene import CSR, Scene
 
 BUNDLED = sorted(p.name for p in SCENES.glob("*.h5"))
 
@@ -187,6 +191,17 @@ def make_directory(path: Path) -> None:
     path.mkdir()
 
 
+def make_fifo(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+def make_socket(path: Path) -> None:
+    path.unlink()
+    with socket.socket(socket.AF_UNIX) as s:
+        s.bind(os.path.relpath(path))
+
+
 def make_foreign(path: Path) -> None:
     with h5py.File(path, "w") as file:
         file["x"] = np.ones(3)
@@ -205,6 +220,10 @@ def cut(keep):
 NOT_SCENES = {
     "missing": (Path.unlink, "no such file"),
     "directory": (make_directory, "is a directory, not a scene"),
+    "fifo": (make_fifo, "is a device, FIFO or socket, not a scene"),
+    "socket": (make_socket, "is a device, FIFO or socket, not a scene"),
+    "device": (lambda p: p.unlink() or p.symlink_to("/dev/zero"), "is a device, FIFO or socket, not a scene"),
+    "link_to_itself": (lambda p: p.unlink() or p.symlink_to(p), "cannot be read: Too many levels"),
     "empty": (lambda p: p.write_bytes(b""), "not an HDF5 file"),
     "text": (lambda p: p.write_text("fields: mass\n" * 100), "not an HDF5 file, so not a scene; make one with"),
     "foreign": (make_foreign, "an HDF5 file, but not a petsc_fs scene: it has no encoding-type"),
@@ -282,12 +301,12 @@ MM = "blocks/mass/mass"
 DAMAGE = {
     "older_version": (put("encoding-version", 0), "written in version 0 of the format, which is no longer read"),
     "newer_version": (put("encoding-version", 2), "written in version 2 of the format, .* update petsc_fs"),
-    "version_in_words": (put("encoding-version", "one"), "encoding-version is 'one', expected the number 1"),
-    "no_version": (unset("encoding-version"), "encoding-version is None"),
+    "version_in_words": (put("encoding-version", "one"), "encoding-version: expected a whole number, found 'one'"),
+    "no_version": (unset("encoding-version"), "the scene is incomplete: .*'encoding-version'"),
     "other_type": (put("encoding-type", "anndata"), "not a petsc_fs scene: its encoding-type is 'anndata'"),
     "no_dimension": (unset("dimension"), "the scene is incomplete: .*'dimension'"),
     "dimension_zero": (put("dimension", 0), "dimension: expected 2 or 3, found 0"),
-    "dimension_in_words": (put("dimension", "two"), "the scene is damaged .*two"),
+    "dimension_in_words": (put("dimension", "two"), "dimension: expected a whole number, found 'two'"),
     "no_model": (unset("model"), "the scene is incomplete: .*'model'"),
     "no_time": (unset("time"), "the scene is incomplete: .*'time'"),
     "no_fields": (delete("fields"), "the scene is incomplete: .*fields"),
@@ -305,13 +324,19 @@ DAMAGE = {
     "no_array_of_the_material": (delete("material/porosity"), "the scene is incomplete: .*'porosity'"),
     "no_number_of_the_material": (unset("biot_coefficient", "material"), "incomplete: .*'biot_coefficient'"),
     "no_time_step": (unset("time_step", "material"), "the scene is incomplete: .*'time_step'"),
-    "short_rhs": (store("fields/mass/rhs", shorter), "mass: rhs has 5 entries, expected 6"),
-    "long_rhs": (store("fields/mass/rhs", longer), "mass: rhs has 7 entries, expected 6"),
+    "short_rhs": (store("fields/mass/rhs", shorter), r"mass: rhs has shape \(5,\), expected \(6,\)"),
+    "long_rhs": (store("fields/mass/rhs", longer), r"mass: rhs has shape \(7,\), expected"),
     "rhs_of_two_columns": (store("fields/mass/rhs", lambda v: np.stack([v, v], 1)), r"rhs has shape \(6, 2\)"),
-    "rhs_is_a_number": (store("fields/mass/rhs", lambda v: 1.0), "the scene is damaged"),
-    "short_reference": (store("fields/mass/reference", shorter), "mass: reference has 5 entries, expected 6"),
-    "long_centers": (store("fields/mass/cell_centers", longer), "mass: cell_centers has 7 entries, expected 6"),
-    "long_states": (store("fields/contact/contact_state", longer), "contact: contact_state has 3 entries, expected 2"),
+    "rhs_is_a_number": (store("fields/mass/rhs", lambda v: 1.0), r"rhs has shape \(\), expected"),
+    "short_reference": (store("fields/mass/reference", shorter), r"mass: reference has shape \(5,\), expected"),
+    "long_centers": (
+        store("fields/mass/cell_centers", longer),
+        r"mass: cell_centers has shape \(7, 3\), expected \(6, 3\)",
+    ),
+    "long_states": (
+        store("fields/contact/contact_state", longer),
+        r"contact: contact_state has shape \(3,\), expected",
+    ),
     "long_material": (store("material/porosity", longer), r"material: porosity has shape \(7,\), expected \(6,\)"),
     "short_indptr": (store(f"{MM}/indptr", shorter), r"block \(mass, mass\): indptr has 6 entries, expected 7"),
     "long_indptr": (store(f"{MM}/indptr", longer), r"block \(mass, mass\): indptr has 8 entries, expected 7"),
@@ -328,9 +353,9 @@ DAMAGE = {
     "fractional_indices": (store(f"{MM}/indices", lambda i: i + 0.5), "indptr and indices must be integers"),
     "fractional_indptr": (store(f"{MM}/indptr", lambda i: i + 0.5), "indptr and indices must be integers"),
     "text_in_data": (store(f"{MM}/data", as_text), "the scene is damaged"),
-    "text_in_indices": (store(f"{MM}/indices", as_text), "indptr and indices must be integers"),
+    "text_in_indices": (store(f"{MM}/indices", as_text), "indptr and indices: expected real numbers"),
     "text_in_rhs": (store("fields/mass/rhs", as_text), "the scene is damaged"),
-    "text_in_states": (store("fields/contact/contact_state", as_text), "contact_state: expected 0"),
+    "text_in_states": (store("fields/contact/contact_state", as_text), "contact_state: expected real numbers"),
     "text_in_cell_dimension": (store("fields/mass/cell_dimension", as_text), "the scene is damaged"),
     "text_in_material": (store("material/porosity", as_text), "the scene is damaged"),
     "complex_data": (store(f"{MM}/data", lambda d: d + 1j), "the scene is damaged"),
@@ -343,7 +368,7 @@ DAMAGE = {
     "block_size_zero": (put("block_size", 0, "fields/mass"), "mass: block_size is 0, expected 1"),
     "odd_size": (put("size", 9, "fields/momentum"), "momentum: 9 rows is not a multiple of block size 2"),
     "negative_size": (put("size", -2, "fields/momentum"), "momentum: -2 rows"),
-    "huge_size": (put("size", 2**62, "fields/mass"), "mass: rhs has 6 entries, expected"),
+    "huge_size": (put("size", 2**62, "fields/mass"), r"mass: rhs has shape \(6,\), expected \(46"),
     "block_shape": (put("shape", (6, 7), MM), r"block \(mass, mass\): shape is \(6, 7\), expected \(6, 6\)"),
     "compressed_columns": (put("encoding-type", "csc_matrix", MM), "encoding-type is 'csc_matrix', expected 'csr"),
     "group_for_dataset": (lambda f: f.move(f"{MM}/data", f"{MM}/x") or f.create_group(f"{MM}/data"), "is damaged"),
@@ -362,6 +387,211 @@ def test_a_scene_with_one_thing_wrong_says_which(full, change, message):
         hdf5.read(full)
     assert str(error.value).startswith(f"{full}: ")
     assert "\n" not in str(error.value)
+
+
+def rewritten(path: Path, convert) -> None:
+    """The same file with each attribute passed through a function."""
+    with h5py.File(path, "r+") as file:
+        groups = [file]
+        file.visititems(lambda _, item: groups.append(item))
+        for group in groups:
+            for name, value in list(group.attrs.items()):
+                group.attrs[name] = convert(value)
+
+
+def number_or_text(number, text):
+    """A function of attributes: what to do with numbers, and with texts or arrays of them."""
+    return lambda v: text(v) if isinstance(v, str) or np.asarray(v).dtype.kind == "O" else number(v)
+
+
+LANGUAGES = {
+    "fixed_length_text": number_or_text(np.asarray, lambda v: np.asarray(v, dtype="S")),
+    "text_with_blanks": number_or_text(np.asarray, lambda v: np.char.ljust(np.asarray(v, dtype="S"), 30)),
+    "array_of_one_text": number_or_text(np.asarray, lambda v: np.atleast_1d(np.asarray(v, dtype="S"))),
+    "doubles": number_or_text(np.float64, lambda v: v),
+    "arrays_of_one": number_or_text(np.atleast_1d, lambda v: v),
+    "arrays_of_two_dimensions": number_or_text(lambda v: np.atleast_2d(np.float64(v)), lambda v: v),
+    "big_endian": number_or_text(lambda v: np.asarray(v, dtype=">f8"), lambda v: v),
+}
+
+
+@pytest.mark.parametrize("convert", LANGUAGES.values(), ids=LANGUAGES)
+def test_attributes_are_read_as_any_language_writes_them(full, convert):
+    rewritten(full, convert)
+    assert_same(full_scene(), hdf5.read(full))
+
+
+@pytest.mark.parametrize("kind", ["u8", "u2", ">i4", "i1"])
+def test_integers_of_any_type_become_signed_ones(full, kind):
+    with h5py.File(full, "r+") as file:
+        for name in [f"{MM}/indptr", f"{MM}/indices", "fields/contact/contact_state", "fields/mass/cell_dimension"]:
+            store(name, lambda values: values.astype(kind))(file)
+    scene = hdf5.read(full)
+    assert_same(full_scene(), scene)
+    scene.check_rows()
+    assert scene.blocks["mass", "mass"].indices.dtype in (np.int8, np.int32, np.int64)
+
+
+MATLAB = {
+    "double_indices": lambda v: v.astype(float),
+    "columns": lambda v: v[:, None] if v.ndim == 1 else v,
+    "rows": lambda v: v[None] if v.ndim == 1 else v,
+}
+
+
+@pytest.mark.parametrize("convert", MATLAB.values(), ids=MATLAB)
+def test_arrays_are_read_as_matlab_writes_them(full, convert):
+    with h5py.File(full, "r+") as file:
+        names = []
+        file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+        for name in names:
+            store(name, convert)(file)
+    assert_same(full_scene(), hdf5.read(full))
+    rows = {f: (full_scene().block_size(f), n) for f, n in full_scene().sizes.items()}
+    assert_same(full_scene().restrict(rows), hdf5.read(full, lambda *_: rows))
+
+
+def test_a_text_that_is_nothing_is_empty(full):
+    with h5py.File(full, "r+") as file:
+        file.attrs["model"] = h5py.Empty("S1")
+    assert hdf5.read(full).metadata.model == ""
+
+
+@pytest.mark.parametrize("wrong", [1.5, np.nan, [1, 2], "one", h5py.Empty("i4"), np.zeros(0), 1j])
+@pytest.mark.parametrize("name", ["dimension", "encoding-version", "newton_index"])
+def test_an_attribute_that_is_no_whole_number_is_named(full, name, wrong):
+    with h5py.File(full, "r+") as file:
+        file.attrs[name] = wrong
+    with pytest.raises(SceneError, match=f"{name}: expected a whole number, found"):
+        hdf5.read(full)
+
+
+def virtual(path: Path, values: np.ndarray) -> h5py.VirtualLayout:
+    layout = h5py.VirtualLayout(shape=values.shape, dtype=values.dtype)
+    layout[:] = h5py.VirtualSource(str(path), "x", shape=values.shape)
+    return layout
+
+
+def outside(file: h5py.File, name: str, values: np.ndarray) -> None:
+    source = Path(file.filename).with_name("source.h5")
+    with h5py.File(source, "w") as other:
+        other["x"] = values
+    file[name] = h5py.ExternalLink(source.name, "x")
+
+
+ELSEWHERE = {
+    "source_missing": (
+        lambda f, name, v: f.create_virtual_dataset(name, virtual(Path("nowhere.h5"), v), fillvalue=0),
+        "lies in other files; a scene is one file: h5repack",
+    ),
+    "external_storage": (
+        lambda f, name, v: f.create_dataset(name, v.shape, v.dtype, external=[("/dev/zero", 0, v.nbytes)]),
+        "lies in other files",
+    ),
+    "external_link": (outside, "lies in another file"),
+    "no_chunk": (
+        lambda f, name, v: f.create_dataset(name, v.shape, v.dtype, chunks=(2,)),
+        "is not written in full, so that HDF5 would make it up",
+    ),
+    "one_chunk": (
+        lambda f, name, v: f.create_dataset(name, v.shape, v.dtype, chunks=(2,), compression="gzip").write_direct(
+            v, np.s_[:2], np.s_[:2]
+        ),
+        "is not written in full",
+    ),
+    "never_written": (lambda f, name, v: f.create_dataset(name, v.shape, v.dtype), "is not written in full"),
+}
+
+
+@pytest.mark.parametrize("name", ["fields/mass/rhs", "blocks/mass/mass/data", "material/porosity"])
+@pytest.mark.parametrize(("make", "message"), ELSEWHERE.values(), ids=ELSEWHERE)
+def test_numbers_that_are_not_in_the_file_are_not_made_up(full, make, message, name):
+    with h5py.File(full, "r+") as file:
+        values = file[name][()]
+        del file[name]
+        make(file, name, values)
+    with pytest.raises(SceneError, match=rf"full\.h5: /{name} {message}"):
+        hdf5.read(full)
+
+
+def test_a_file_that_promises_more_than_it_holds_takes_no_memory(full):
+    n = 10**10
+    with h5py.File(full, "r+") as file:
+        file["fields/mass"].attrs["size"] = n
+        for name in file["fields/mass"]:
+            shape = (n, *file[f"fields/mass/{name}"].shape[1:])
+            del file[f"fields/mass/{name}"]
+            file.create_dataset(f"fields/mass/{name}", shape, "f8", chunks=(2**16, 3)[: len(shape)], compression="gzip")
+    tracemalloc.start()
+    with pytest.raises(SceneError, match=r"/fields/mass/.* is not written in full"):
+        hdf5.read(full)
+    assert tracemalloc.get_traced_memory()[1] < 2**25
+    tracemalloc.stop()
+
+
+def test_more_than_any_compression_gives_is_refused(full, monkeypatch):
+    monkeypatch.setattr(hdf5, "SMALL", 2**16)
+    with h5py.File(full, "r+") as file:
+        twice = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        twice.set_chunk((2**17,))
+        twice.set_deflate(9)
+        twice.set_deflate(9)
+        file["fields/mass"].create_dataset("more", data=np.zeros(2**17), dcpl=twice)
+    with pytest.raises(SceneError, match=r"/fields/mass/more says that it has 1048576 bytes, and \d+ are there"):
+        hdf5.read(full)
+
+
+def test_a_scene_larger_than_the_machine_is_refused(full, monkeypatch):
+    monkeypatch.setattr(os, "sysconf", lambda name: 10)
+    with pytest.raises(SceneError, match=r"full\.h5: takes 0 GiB, and this machine has 0 GiB"):
+        hdf5.read(full)
+
+
+def test_a_file_that_another_program_writes_is_locked(full):
+    code = f"import h5py\nwith h5py.File({str(full)!r}, 'r+'): print('open', flush=True); input()"
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        other.stdout.readline()
+        with pytest.raises(SceneError, match=r"full\.h5: locked: another program has it open for writing"):
+            hdf5.read(full)
+        other.communicate(b"\n")
+    assert_same(full_scene(), hdf5.read(full))
+
+
+def test_a_file_whose_writer_died_says_how_to_clear_it(full):
+    code = f"import h5py, os\nf = h5py.File({str(full)!r}, 'w', libver='latest'); f.flush(); os._exit(0)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+    with pytest.raises(SceneError, match=r"a program that wrote to it has not closed it; .*h5clear -s full\.h5"):
+        hdf5.read(full)
+
+
+def test_unknowns_numbered_by_component_are_found_in_a_file(model1):
+    with h5py.File(model1, "r+") as file:
+        group = file["blocks/momentum/momentum"]
+        size = file["fields/momentum"].attrs["size"]
+        block = CSR(*(group[name][()] for name in CSR._fields))
+        order = np.arange(size).reshape(-1, 2).T.ravel()
+        other = Scene.from_matrix(block, np.ones(size), {"mass": order}, dimension=2).blocks["mass", "mass"]
+        for name, values in zip(CSR._fields, other, strict=True):
+            group[name][...] = values
+    with pytest.raises(LayoutError, match=r"model1\.h5: momentum: the unknowns are numbered component by component"):
+        hdf5.read(model1)
+
+
+@pytest.mark.parametrize("target", ["/dev/null", "fifo"])
+def test_devices_are_no_files_to_write(tmp_path, target):
+    os.mkfifo(tmp_path / "fifo")
+    before = os.stat(tmp_path / target)
+    with pytest.raises(UsageError, match="is a directory or device, not a file"):
+        hdf5.write(full_scene(), tmp_path / target)
+    assert os.stat(tmp_path / target).st_ino == before.st_ino
+
+
+def test_a_link_that_is_written_stays_a_link(full):
+    link = full.with_name("link.h5")
+    link.symlink_to(full.name)
+    hdf5.write(full_scene(seed=1), link)
+    assert link.is_symlink()
+    assert_same(full_scene(seed=1), hdf5.read(full))
 
 
 @pytest.mark.parametrize("name", ["fields/momentum/rhs", "blocks/momentum/momentum/data"])

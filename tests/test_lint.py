@@ -55,7 +55,7 @@ BROKEN = {
     ),
     "no_number": (
         edited(GOOD, "-ksp_rtol 1e-10", "-ksp_rtol abc"),
-        ["mine.opts: ", "PETSc refuses", "Input string abc has no numeric value"],
+        ["mine.opts: -ksp_rtol abc: expected a number from 0 to below 1"],
     ),
     "no_ksp_type": (
         edited(GOOD, "-ksp_type preonly\n      -pc_type hypre", "-pc_type hypre"),
@@ -82,7 +82,7 @@ BROKEN = {
         edited(POROMECHANICS, "  -fs_pc_type", "  -fs_type analitic\n  -fs_pc_type"),
         ["-fieldsplit_mass_fs_type analitic: expected analytic or algebraic"],
     ),
-    "wrong_storage": ("-petsc_fs_mat_type nested\n", ["-petsc_fs_mat_type nested: expected nest or merged or aij"]),
+    "wrong_partition": ("-petsc_fs_partition nested\n", ["-petsc_fs_partition nested: expected auto or "]),
     "no_text": (b"\x89HDF\xff\xfe\x00", ["mine.opts: not readable as text"]),
 }
 

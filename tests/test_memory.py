@@ -12,8 +12,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from sample import SCENES, full_scene
 
+from petsc_fs import csr as csr_module
 from petsc_fs import memory, options
-from petsc_fs import scene as scene_module
 from petsc_fs.io import hdf5
 from petsc_fs.partition import Layout
 from petsc_fs.scene import CSR, Scene
@@ -196,7 +196,7 @@ def test_matrix_is_cut_into_the_same_blocks_in_any_pieces(monkeypatch: pytest.Mo
     matrix = CSR(np.searchsorted(rows, np.arange(n + 1)), columns, dense[rows, columns])
     results = []
     for slab in (1, 7, 1 << 20):
-        monkeypatch.setattr(scene_module, "SLAB", slab)
+        monkeypatch.setattr(csr_module, "SLAB", slab)
         results.append(Scene.from_matrix(matrix, np.ones(n), fields, dimension=2).blocks)
     for found in results:
         assert found.keys() == results[0].keys()

@@ -4,12 +4,12 @@ import ctypes
 from pathlib import Path
 
 import pytest
+from mpi4py import MPI
 from petsc4py import PETSc
-from sample import SCENES
 
 from petsc_fs import options
 from petsc_fs.errors import UsageError
-from petsc_fs.io import hdf5
+from petsc_fs.options import Given
 
 SHIPPED = sorted(p.name for p in options.shipped_folder().glob("*.opts"))
 
@@ -44,7 +44,7 @@ def test_prefixes_nest_and_comments_vanish(opts):
 -prefix_push a_
   -pc_type hypre
   -prefix_push b_
-    -eigenvalue_range 0.1 -2
+    -eigenvalue_range 0.1,-2  -flag -monitor "ascii:a file.txt"
   -prefix_pop
 
 \t-tol -1e-3
@@ -55,7 +55,9 @@ def test_prefixes_nest_and_comments_vanish(opts):
         "ksp_type": "gmres",
         "ksp_monitor": None,
         "a_pc_type": "hypre",
-        "a_b_eigenvalue_range": "0.1 -2",
+        "a_b_eigenvalue_range": "0.1,-2",
+        "a_b_flag": None,
+        "a_b_monitor": "ascii:a file.txt",
         "a_tol": "-1e-3",
         "last": "1,2",
     }
@@ -76,11 +78,39 @@ def test_petsc_reads_the_same_from_a_file(database, name):
 
 def comm_handle() -> int:
     """PETSC_COMM_SELF as C has it."""
-    from mpi4py import MPI
-
     address = MPI._addressof(MPI.COMM_SELF)
     kind = ctypes.c_void_p if MPI._sizeof(MPI.Comm) == ctypes.sizeof(ctypes.c_void_p) else ctypes.c_int
     return kind.from_address(address).value
+
+
+FORMS = {
+    "unix": lambda text: text.encode(),
+    "windows": lambda text: text.replace("\n", "\r\n").encode(),
+    "old_mac": lambda text: text.replace("\n", "\r").encode(),
+    "byte_order_mark": lambda text: b"\xef\xbb\xbf" + text.encode(),
+    "tabs": lambda text: text.replace(" ", "\t").encode(),
+    "no_last_line_end": lambda text: text.rstrip().encode(),
+    "line_separator_in_a_comment": lambda text: text.replace("outer", "\u2028-x 1").encode(),
+}
+
+
+@pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
+def test_any_editor_will_do(tmp_path, form):
+    (tmp_path / "mine.opts").write_bytes(form("-ksp_type gmres # outer\n-prefix_push a_\n-pc_type lu\n-prefix_pop\n"))
+    assert options.parse(tmp_path / "mine.opts") == {"ksp_type": "gmres", "a_pc_type": "lu"}
+
+
+def test_a_file_may_name_others_in_their_place(tmp_path, opts, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "inner.opts").write_text("-a 1\n-b 1\n")
+    path = opts("-a 0\n-options_file inner.opts\n-b 2\n-prefix_push p_\n-options_file inner.opts\n-prefix_pop\n")
+    assert options.parse(path) == {"a": "1", "b": "2", "p_a": "1", "p_b": "1"}
+    (tmp_path / "inner.opts").write_text("-a\n-options_file mine.opts\n")
+    with pytest.raises(UsageError, match=r"mine.opts:2: .*inner.opts:2: options file .*mine.opts includes itself"):
+        options.parse(path)
+    (tmp_path / "inner.opts").unlink()
+    with pytest.raises(UsageError, match=r"mine.opts:2: options file inner.opts: no such file; shipped are "):
+        options.parse(path)
 
 
 BAD_LINES = {
@@ -88,6 +118,11 @@ BAD_LINES = {
     "number": ("\n\n-5 x\n", ":3: '-5' is not an option"),
     "lone_dash": ("# c\n- ksp_type gmres\n", ":2: '-' is not an option"),
     "two_dashes": ("--ksp_type gmres\n", ":1: '--ksp_type' is not an option"),
+    "stray": ("\n-ksp_rtol 1e-10 5\n", ":2: '5' belongs to no option: -ksp_rtol has its value already"),
+    "equals": ("-ksp_rtol=1e-3\n", ":1: -ksp_rtol=1e-3: a space, no '=', goes between an option and its value"),
+    "no_break_space": ("-ksp_type\u00a0cg\n", ":1: -ksp_type\u00a0cg: PETSc cannot take the character U+00A0"),
+    "line_separator": ("-a 1\u2028-b 2\n", ":1: -a: PETSc cannot take the character U+2028"),
+    "no_file": ("-options_file\n", ":1: -options_file without the name of the file"),
     "push_nothing": ("-a\n-prefix_push # qr_\n", ":2: -prefix_push without a prefix"),
     "pop_too_often": (
         "-prefix_push a_\n-prefix_pop\n-prefix_pop\n",
@@ -107,10 +142,38 @@ def test_a_bad_line_is_named_by_its_number(opts, text, message):
 
 def test_a_file_that_is_no_text_is_refused(opts):
     path = opts("")
-    path.write_bytes(b"\x89HDF\r\n\x1a\n\xff\xff")
-    for read in (options.parse, options.read_header):
-        with pytest.raises(UsageError, match="not readable as text"):
-            read(path)
+    for content in (b"\x89HDF\r\n\x1a\n\xff\xff", "-a\n".encode("utf-16"), b"-ksp_type cg\x00\n"):
+        path.write_bytes(content)
+        for read in (options.parse, options.read_header):
+            with pytest.raises(UsageError, match="not readable as text"):
+                read(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("ksp_rtol", "nan", "-ksp_rtol nan: expected a number from 0 to below 1"),
+        ("ksp_rtol", "1", "-ksp_rtol 1: expected a number from 0 to below 1"),
+        ("a_ksp_rtol", "inf", "-a_ksp_rtol inf: expected a number from 0 to below 1"),
+        ("ksp_rtol", None, "-ksp_rtol without a value: expected a number from 0 to below 1"),
+        ("ksp_rtol", "", "-ksp_rtol without a value: expected a number from 0 to below 1"),
+        ("ksp_rtol", "-1e-3", "-ksp_rtol -1e-3: expected a number from 0 to below 1"),
+        ("ksp_rtol", "1e-3x", "-ksp_rtol 1e-3x: expected a number from 0 to below 1"),
+        ("ksp_atol", "nan", "-ksp_atol nan: expected a number from 0 on"),
+        ("ksp_max_it", "1.5", "-ksp_max_it 1.5: expected a whole number from 0 on"),
+        ("ksp_gmres_restart", "0", "-ksp_gmres_restart 0: expected a whole number from 1 on"),
+    ],
+)
+def test_numbers_that_decide_when_to_stop_are_looked_at(name, value, expected):
+    with pytest.raises(UsageError) as error:
+        options.check({"ksp_type": "gmres", name: value})
+    assert str(error.value) == expected
+
+
+def test_other_numbers_pass():
+    options.check({"ksp_rtol": "0", "ksp_atol": "1e-50", "ksp_max_it": "DEFAULT", "my_ksp_rtol_x": "nan", "a": None})
+    for file in options.shipped():
+        options.check(options.parse(file.path))
 
 
 def test_insert_leaves_what_is_set_already(opts, database):
@@ -141,34 +204,6 @@ def test_a_file_fits_its_fields_in_any_order_no_more_and_no_fewer(opts):
     assert header.fits(["momentum", "mass"])
     assert not header.fits(["mass"])
     assert not header.fits(["mass", "momentum", "intf_flow"])
-
-
-DEFAULTS = {
-    "model1": "contact_poromechanics_fast.opts",
-    "model2": "contact_poromechanics_fast.opts",
-    "model3": "contact_poromechanics_fast.opts",
-    "contact": "contact_mechanics_fast.opts",
-    "biot": "poromechanics_fast.opts",
-    "flow": "flow_fast.opts",
-}
-
-
-@pytest.mark.parametrize(("scene", "file"), DEFAULTS.items(), ids=DEFAULTS)
-def test_every_bundled_scene_has_its_default(scene, file):
-    _, sizes = hdf5.read_sizes(SCENES / f"{scene}.h5")
-    assert options.default_for(reversed(list(sizes))) == options.shipped_folder() / file
-
-
-def test_the_table_of_defaults_is_complete():
-    assert set(DEFAULTS) == {p.stem for p in SCENES.glob("*.h5")}
-    fields = [file.fields for file in options.shipped() if file.default]
-    assert len(fields) == len(set(fields))
-
-
-@pytest.mark.parametrize("fields", [["contact"], ["mass", "contact"], []], ids=lambda f: "+".join(f) or "none")
-def test_other_fields_have_no_default(fields):
-    with pytest.raises(UsageError, match=r"no default solver for the fields .*: name one with -options_file"):
-        options.default_for(fields)
 
 
 def test_a_path_is_taken_before_a_shipped_name(tmp_path, monkeypatch, opts):
@@ -213,39 +248,27 @@ def test_a_solver_uses_its_options_and_no_others(database):
     assert [name for name in options.unused() if name.startswith("tst_")] == ["tst_pc_tpye"]
 
 
-LONG = "fieldsplit_1_fieldsplit_mechanics_" * 3
-"""More than 64 characters, where PETSc 3.18 overruns a buffer if it prints the help."""
+MECHANICS = "qr_fieldsplit_1_fieldsplit_mechanics_component_"
 
 
-@pytest.mark.mpi
-@pytest.mark.parametrize("prefix", ["", "tst_", LONG], ids=["none", "short", "long"])
-def test_known_names_are_those_that_petsc_explains(database, capfd, prefix):
-    chosen = {"ksp_type": "gmres", "pc_type": "hypre", "pc_hypre_type": "boomeramg"}
-    for name, value in chosen.items():
-        database[prefix + name] = value
-    database[prefix + "ksp_rotl"] = "1"
-    use(prefix)
-    before = database.getAll()
-    names = options.known_names()
-    expected = {*chosen, "ksp_rtol", "ksp_gmres_restart", "pc_hypre_boomeramg_strong_threshold"}
-    assert {prefix + name for name in expected} <= names
-    assert prefix + "pc_hypre_boomeramg_stong_threshold" not in names
-    assert prefix + "pc_gamg_threshold" not in names
-    assert prefix + "ksp_rotl" not in names
-    assert names == options.known_names()
-    assert database.getAll() == before
-    assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.mpi
-def test_known_names_survive_types_that_do_not_exist(database, capfd):
-    database["tst_ksp_type"], database["tst_pc_type"] = "gmrse", "python"
-    database["tst_pc_python_type"] = "no_such_module.PC"
-    database["tst_sub_ksp_type"] = "cg"
-    for name in database.getAll():
-        database.getString(name, "")
-    assert {"tst_ksp_type", "tst_pc_python_type", "tst_sub_ksp_rtol"} <= options.known_names()
-    assert capfd.readouterr() == ("", "")
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        (f"{MECHANICS}pc_hypre_boomeramg_stong_threshold", f"{MECHANICS}pc_hypre_boomeramg_strong_threshold"),
+        ("qr_fieldsplit_1_feildsplit_mechanics_pc_type", "qr_fieldsplit_1_fieldsplit_mechanics_pc_type"),
+        ("ksp_rtoll", "ksp_rtol"),
+        ("qr_sidee", "qr_side"),
+        ("petsc_fs_partitoin", "petsc_fs_partition"),
+        ("ksp_montior", "ksp_monitor"),
+        ("zzzzzzzz", None),
+    ],
+)
+def test_what_a_misspelt_option_may_have_meant(database, name, expected):
+    database[name] = "1"
+    text = options.explain([name], {name})
+    hint = f"; did you mean -{expected}" if expected else ""
+    assert text.startswith(f"option -{name} from the command line was not used{hint}")
+    assert text.endswith("?" if expected else "not used")
 
 
 def test_the_closest_name_comes_first():
@@ -254,3 +277,43 @@ def test_the_closest_name_comes_first():
     assert found[0] == "qr_pc_hypre_boomeramg_strong_threshold"
     assert len(found) <= 3
     assert options.closest("something_else", names) == []
+
+
+def test_given_options_count_in_their_order(opts):
+    path = opts("-ksp_rtol 1e-3\n-ksp_max_it 7\n")
+    given = Given.of(["-ksp_max_it", "5", "-options_file", str(path), "--ksp_rtol", "1e-4", "-flag", "-shift", "-1"])
+    assert given.values == {"ksp_max_it": "7", "ksp_rtol": "1e-4", "flag": None, "shift": "-1"}
+    assert given.files == (path,)
+    for words, message in (
+        (["-ksp_rtol", "nan"], "-ksp_rtol nan: expected a number"),
+        (["-a", "1", "2"], "'2' belongs to no option: -a has its value already"),
+        (["-options_file"], "-options_file without the name of the file"),
+        (["-prefix_push", "x_", "-a"], "the command line: 1 -prefix_push without a -prefix_pop"),
+        (["-a", "caf\udce9"], r"-a: PETSc cannot take the character U\+DCE9"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            Given.of(words)
+
+
+@pytest.mark.mpi
+def test_an_option_that_one_rank_used_is_used_and_the_others_are_told_alike_on_all(database, monkeypatch):
+    comm = MPI.COMM_WORLD
+    monkeypatch.setenv("PETSC_OPTIONS", "-tst_foreign -tst_snes 3")
+    given = Given.of(["-tst_some", "1", "-tst_none", "2", "-ksp_rtoll", "1"])
+    options.insert_all(given.values | {"tst_foreign": None, "tst_snes": "3"})
+    if comm.rank == comm.size - 1:
+        assert database.getInt("tst_some") == 1
+    with pytest.raises(UsageError) as error:
+        given.judge(comm)
+    assert str(error.value).splitlines() == [
+        "2 options were not used:",
+        "  option -ksp_rtoll from the command line was not used; did you mean -ksp_rtol or -ksp_atol?",
+        "  option -tst_none from the command line was not used",
+    ]
+    for name in ("tst_none", "ksp_rtoll"):
+        database.getInt(name)
+    foreign = [f"  option -{name} from PETSC_OPTIONS was not used" for name in ("tst_foreign", "tst_snes")]
+    expected = ["2 options were not used:", *foreign] if comm.rank == 0 else []
+    assert given.judge(comm).splitlines() == expected
+    database["petsc_fs_allow_unused"] = "tst_*"
+    assert given.judge(comm) == ""

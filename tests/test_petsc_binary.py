@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from petsc4py import PETSc
-from sample import SCENES, assert_same, dense, full_scene
+from sample import SCENES, assert_same, csr, dense, full_scene
 
 from petsc_fs.errors import LayoutError, SceneError, UsageError
 from petsc_fs.io import hdf5, petsc_binary
+from petsc_fs.scene import Scene
 
 BUNDLED = sorted(p.stem for p in SCENES.glob("*.h5") if p.stem != "model3")
 FILES = ("matrix.petsc", "rhs.petsc", "reference.petsc", "fields/mass.petsc")
@@ -162,26 +163,90 @@ def test_a_folder_without_index_sets_says_which_there_could_be(folder, tmp_path)
         petsc_binary.to_scene(folder, tmp_path / "back.h5")
 
 
+NOT_PETSC, CUT = "not a file in PETSc's binary format, or of another kind", "cut short, or damaged"
 JUNK = {
-    "text": lambda data, other: b"hello\n" * 50,
-    "empty": lambda data, other: b"",
-    "header_only": lambda data, other: data[:8],
-    "cut_in_half": lambda data, other: data[: len(data) // 2],
-    "random": lambda data, other: np.random.default_rng(0).bytes(400),
-    "other_kind": lambda data, other: other,
-    "two_thousand_million_rows": lambda data, other: data[:4] + b"\x7f\xff\xff\xf0" + data[8:],
+    "text": (lambda data, other: b"hello\n" * 50, NOT_PETSC),
+    "empty": (lambda data, other: b"", NOT_PETSC),
+    "header_only": (lambda data, other: data[:8], CUT),
+    "cut_in_half": (lambda data, other: data[: len(data) // 2], CUT),
+    "last_byte_missing": (lambda data, other: data[:-1], CUT),
+    "more_at_the_end": (lambda data, other: data + b"\0" * 12, CUT),
+    "random": (lambda data, other: np.random.default_rng(0).bytes(400), NOT_PETSC),
+    "other_kind": (lambda data, other: other, NOT_PETSC),
+    "two_thousand_million_rows": (lambda data, other: data[:4] + b"\x7f\xff\xff\xf0" + data[8:], CUT),
+    "negative_length": (lambda data, other: data[:4] + b"\xff\xff\xff\xf0" + data[8:], CUT),
 }
 
 
-@pytest.mark.parametrize("make", JUNK.values(), ids=JUNK)
+@pytest.mark.parametrize(("make", "message"), JUNK.values(), ids=JUNK)
 @pytest.mark.parametrize("name", FILES)
-def test_a_file_that_is_not_petscs_is_named(folder, tmp_path, name, make):
+def test_a_file_that_is_not_petscs_is_named(folder, tmp_path, name, make, message):
     other = folder / ("matrix.petsc" if name != "matrix.petsc" else "rhs.petsc")
     (folder / name).write_bytes(make((folder / name).read_bytes(), other.read_bytes()))
-    with pytest.raises(SceneError, match=f"{name}: not a file in PETSc's binary format, or of another kind") as error:
+    with pytest.raises(SceneError, match=f"{name}: {message}") as error:
         petsc_binary.to_scene(folder, tmp_path / "back.h5")
     assert "\n" not in str(error.value)
     assert not (tmp_path / "back.h5").exists()
+
+
+def test_a_fifo_is_refused_at_once(folder, tmp_path):
+    (folder / "rhs.petsc").unlink()
+    os.mkfifo(folder / "rhs.petsc")
+    with pytest.raises(SceneError, match=r"rhs\.petsc: is a device, FIFO or socket"):
+        petsc_binary.to_scene(folder, tmp_path / "back.h5")
+
+
+def store_raw(
+    folder: Path, scene: Scene, integer: str = ">i4", number: str = ">f8", dense_matrix: bool = False
+) -> None:
+    """A folder as PETSc writes it that was built for other integers and numbers."""
+
+    def raw(name: str, *parts: object) -> None:
+        kinds = [np.asarray(part).astype(integer if np.asarray(part).dtype.kind == "i" else number) for part in parts]
+        (folder / name).write_bytes(b"".join(part.tobytes() for part in kinds))
+
+    A, n, start = dense(scene), sum(scene.sizes.values()), 0
+    (folder / "fields").mkdir(parents=True)
+    block = csr(A)
+    if dense_matrix:
+        raw("matrix.petsc", [1211216, n, n, -1], A)
+    else:
+        raw("matrix.petsc", [1211216, n, n, block.data.size], np.diff(block.indptr), block.indices, block.data)
+    raw("rhs.petsc", [1211214, n], np.concatenate([scene.rhs[f] for f in scene.fields]))
+    for f in scene.fields:
+        raw(f"fields/{f}.petsc", [1211218, scene.sizes[f]], np.arange(start, start + scene.sizes[f]))
+        start += scene.sizes[f]
+
+
+@pytest.mark.parametrize("dense_matrix", [False, True], ids=["aij", "dense"])
+@pytest.mark.parametrize("number", [">f8", "<f8", ">f4"])
+@pytest.mark.parametrize("integer", [">i4", ">i8", "<i4"])
+def test_folders_of_other_builds_of_petsc_are_read(tmp_path, integer, number, dense_matrix):
+    scene = full_scene()
+    store_raw(tmp_path / "petsc", scene, integer, integer[0] + number[1:], dense_matrix)
+    petsc_binary.to_scene(tmp_path / "petsc", tmp_path / "back.h5", dimension=2)
+    back = hdf5.read(tmp_path / "back.h5")
+    kind = np.float32 if number == ">f4" else np.float64
+    np.testing.assert_array_equal(dense(back), dense(scene).astype(kind))
+    for f in scene.fields:
+        np.testing.assert_array_equal(back.rhs[f], scene.rhs[f].astype(kind))
+
+
+@pytest.mark.parametrize("integer", [">i4", ">i8"])
+@pytest.mark.parametrize("only", ["matrix.petsc", "rhs.petsc"])
+def test_complex_numbers_are_named(tmp_path, integer, only):
+    store_raw(tmp_path / "complex", full_scene(), integer, ">c16")
+    store_raw(tmp_path / "petsc", full_scene(), integer)
+    shutil.copy(tmp_path / "complex" / only, tmp_path / "petsc")
+    with pytest.raises(SceneError, match=f"{only}: numbers of 16 bytes, as a PETSc for complex scalars writes them"):
+        petsc_binary.to_scene(tmp_path / "petsc", tmp_path / "back.h5", dimension=2)
+
+
+def test_what_follows_in_the_file_of_the_matrix_does_not_matter(folder, tmp_path):
+    matrix = folder / "matrix.petsc"
+    matrix.write_bytes(matrix.read_bytes() + (folder / "rhs.petsc").read_bytes())
+    petsc_binary.to_scene(folder, tmp_path / "back.h5")
+    assert_same(full_scene(), hdf5.read(tmp_path / "back.h5"))
 
 
 @pytest.mark.parametrize("name", ["rhs.petsc", "reference.petsc"])

@@ -1,14 +1,17 @@
 """Scenes: cutting a matrix into blocks and back, what does not fit together, parts of one rank."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sample import assert_same, csr, dense, full_scene, sparse_random
+from sample import SCENES, assert_same, csr, dense, full_scene, sparse_random
 
-from petsc_fs.errors import LayoutError, SceneError
+from petsc_fs.errors import LayoutError, SceneError, UsageError
+from petsc_fs.io import hdf5
 from petsc_fs.scene import CSR, Scene, contact_state_counts
 
 N = 12  # three cells in 2D: 6 displacements, 3 fluxes, 3 pressures
@@ -59,13 +62,169 @@ def test_rows_and_columns_may_be_any_permutations(seed, momentum, density):
     np.testing.assert_array_equal(dense(scene), permuted(A, scene, rows, columns))
 
 
-def test_entries_of_a_row_may_come_in_any_order(matrix):
-    A, fields = csr(matrix), SPECS["interleaved"]
-    indices, data = A.indices.copy(), A.data.copy()
-    for a, b in zip(A.indptr[:-1], A.indptr[1:], strict=True):
-        indices[a:b], data[a:b] = A.indices[a:b][::-1], A.data[a:b][::-1]
-    scene = Scene.from_matrix(CSR(A.indptr, indices, data), np.ones(N), fields, dimension=2)
-    assert_same(scene, Scene.from_matrix(A, np.ones(N), fields, dimension=2))
+def reversed_rows(A: CSR) -> CSR:
+    order = np.concatenate([np.arange(a, b)[::-1] for a, b in zip(A.indptr[:-1], A.indptr[1:], strict=True)])
+    return CSR(A.indptr, A.indices[order], A.data[order])
+
+
+class ToCsr:
+    """What scipy's other formats offer."""
+
+    format = "coo"
+
+    def __init__(self, A: CSR) -> None:
+        self.A = A
+
+    def tocsr(self) -> CSR:
+        return self.A
+
+
+def typed(indices: str, data: str):
+    return lambda A: CSR(csr(A).indptr.astype(indices), csr(A).indices.astype(indices), csr(A).data.astype(data))
+
+
+FORMS = {
+    "columns_in_any_order": lambda A: reversed_rows(csr(A)),
+    "dense": lambda A: A,
+    "lists": lambda A: A.tolist(),
+    "np_matrix": np.matrix,
+    "by_tocsr": lambda A: ToCsr(csr(A)),
+    "halves_of_entries": lambda A: CSR(csr(A).indptr * 2, np.repeat(csr(A).indices, 2), np.repeat(csr(A).data / 2, 2)),
+    "uint64": typed("u8", "f8"),
+    "int16": typed("i2", "f8"),
+    "big_endian": typed(">i4", ">f8"),
+    "float_columns": typed("f8", "f8"),
+    "long_double": typed("i4", "g"),
+}
+
+
+@pytest.mark.filterwarnings("ignore:the matrix subclass")
+@pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
+@pytest.mark.parametrize("name", ["ranges", "interleaved", "backwards"])
+def test_a_matrix_may_have_any_form(matrix, form, name):
+    fields = SPECS[name]
+    expected = Scene.from_matrix(csr(matrix), np.ones(N), fields, dimension=2)
+    assert_same(Scene.from_matrix(form(matrix), np.ones(N), fields, dimension=2), expected)
+
+
+@pytest.mark.parametrize("make", [lambda A: A.astype(np.float32), lambda A: A > 0, lambda A: np.sign(A).astype("i1")])
+def test_numbers_of_other_types_become_double(matrix, make):
+    scene = Scene.from_matrix(make(matrix), make(matrix)[0], SPECS["ranges"], dimension=2)
+    np.testing.assert_array_equal(dense(scene), make(matrix).astype(float))
+    assert {block.data.dtype for block in scene.blocks.values()} | {scene.rhs["mass"].dtype} == {np.dtype(float)}
+
+
+def test_zeros_that_are_stored_stay_in_the_pattern(matrix):
+    A = csr(np.ones((N, N)))._replace(data=matrix.ravel())
+    scene = Scene.from_matrix(A, np.ones(N), SPECS["interleaved"], dimension=2)
+    assert sum(block.data.size for block in scene.blocks.values()) == N**2
+    np.testing.assert_array_equal(
+        dense(scene), dense(Scene.from_matrix(matrix, np.ones(N), SPECS["interleaved"], dimension=2))
+    )
+
+
+@pytest.mark.parametrize("module", ["csc", "coo", "bsr", "lil", "dia", "csr"])
+def test_matrices_of_scipy_in_any_format(matrix, module):
+    sparse = pytest.importorskip("scipy.sparse")
+    for make in (getattr(sparse, f"{module}_matrix"), getattr(sparse, f"{module}_array")):
+        scene = Scene.from_matrix(make(matrix), sparse.csc_matrix(np.ones((N, 1))), SPECS["interleaved"], dimension=2)
+        np.testing.assert_array_equal(
+            dense(scene), dense(Scene.from_matrix(matrix, np.ones(N), SPECS["interleaved"], dimension=2))
+        )
+
+
+@pytest.mark.parametrize("rhs", [np.arange(N)[:, None], list(range(N)), np.arange(N)[None]])
+def test_a_right_hand_side_may_be_a_list_or_a_column(matrix, rhs):
+    scene = Scene.from_matrix(matrix, rhs, SPECS["ranges"], dimension=2)
+    assert scene.rhs["mass"].tolist() == [9.0, 10.0, 11.0]
+
+
+def test_rows_of_a_field_may_be_a_mask_or_whole_floats(matrix):
+    expected = Scene.from_matrix(matrix, np.ones(N), SPECS["ranges"], dimension=2)
+    masks = {f: np.isin(np.arange(N), rows) for f, rows in SPECS["ranges"].items()}
+    floats = {f: np.asarray(rows, dtype=float) for f, rows in SPECS["ranges"].items()}
+    for fields in (masks, floats, {f: mask.tolist() for f, mask in masks.items()}):
+        assert_same(Scene.from_matrix(matrix, np.ones(N), fields, dimension=2), expected)
+
+
+CHAIN = 20
+
+
+def chain(dimension: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Displacements of cells in a row, coupled in all components; its rows cell by cell, and component by component."""
+    neighbours = 2 * np.eye(CHAIN) - np.eye(CHAIN, k=1) - np.eye(CHAIN, k=-1)
+    A = np.kron(neighbours, np.eye(dimension) + 0.3)
+    numbers = np.arange(dimension * CHAIN)
+    return A, numbers, numbers.reshape(CHAIN, dimension).T.ravel()
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_unknowns_numbered_by_component_are_refused_or_renumbered(dimension):
+    A, cell, component = chain(dimension)
+    b = np.arange(cell.size) + 0.5
+    expected = Scene.from_matrix(A, b, {"momentum": cell}, dimension=dimension)
+    B, c = A[np.ix_(component, component)], b[component]
+    with pytest.raises(LayoutError, match=r'^momentum: .* numbered component by component .* order="component"'):
+        Scene.from_matrix(B, c, {"momentum": cell}, dimension=dimension)
+    for order in ("component", {"momentum": "component", "mass": "cell"}):
+        assert_same(Scene.from_matrix(B, c, {"momentum": cell}, dimension=dimension, order=order), expected)
+    for order in ("cells", {"momentum": "xyz"}):
+        with pytest.raises(UsageError, match="order: expected cell or component"):
+            Scene.from_matrix(A, b, {"momentum": cell}, dimension=dimension, order=order)
+
+
+@pytest.mark.parametrize("name", sorted(p.name for p in SCENES.glob("*.h5")))
+def test_the_pattern_tells_the_order_of_bundled_scenes(name):
+    scene = hdf5.read(SCENES / name)
+    for field in {"momentum", "intf_force"} & set(scene.fields):
+        size, bs = scene.sizes[field], scene.block_size(field)
+        cell_by_cell = scene.blocks[field, field]
+        by_component = Scene.from_matrix(
+            cell_by_cell, np.ones(size), {"mass": np.arange(size).reshape(-1, bs).T.ravel()}, dimension=2
+        ).blocks["mass", "mass"]
+        scene.blocks[field, field] = by_component
+        with pytest.raises(LayoutError, match=f"{field}: the unknowns are numbered component by component"):
+            scene.validate()
+        scene.blocks[field, field] = cell_by_cell
+    scene.validate()
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_random_patterns_raise_no_alarm(seed):
+    rng = np.random.default_rng(seed)
+    A = sparse_random(rng, (36, 36), rng.random())
+    Scene.from_matrix(A, np.ones(36), {"momentum": range(36)}, dimension=int(rng.integers(2, 4)))
+
+
+@pytest.mark.parametrize("stored", [True, False], ids=["zeros", "no_entries"])
+@pytest.mark.parametrize("part", [False, True], ids=["whole", "part"])
+def test_equations_without_entries_are_named(stored, part):
+    scene = full_scene()
+    scene.check_rows()
+    for (r, c), block in scene.blocks.items():
+        if r == "momentum":
+            A = np.zeros((scene.sizes[r], scene.sizes[c]))
+            A[np.repeat(np.arange(A.shape[0]), np.diff(block.indptr)), block.indices] = block.data
+            A[[7, 9]] = 0
+            zero = np.isin(np.repeat(np.arange(A.shape[0]), np.diff(block.indptr)), [7, 9])
+            scene.blocks[r, c] = block._replace(data=np.where(zero, 0, block.data)) if stored else csr(A)
+    if part:
+        scene = scene.restrict({f: (n // 2 // 2 * 2, n) for f, n in scene.sizes.items()})
+    with pytest.raises(SceneError, match=r"^momentum: the equation of cell 3, component y, has no entry .*\(2 such eq"):
+        scene.check_rows()
+
+
+def test_unknowns_in_no_equation_are_named_and_identity_rows_are_fine():
+    A = np.eye(4)
+    fields = {"intf_flow": range(1), "mass": range(1, 4)}
+    Scene.from_matrix(A, np.ones(4), fields, dimension=2).check_rows()
+    A[2] = [0, 0, 0, 1]
+    with pytest.raises(
+        SceneError, match=r"^mass: the unknown of cell 1 has no entry or only zeros in the matrix, which"
+    ):
+        Scene.from_matrix(A, np.ones(4), fields, dimension=2).check_rows()
+    with pytest.raises(SceneError, match=r"^mass: the equation of cell 0 has no entry"):
+        Scene(dimension=3, sizes={"mass": 2}, blocks={}, rhs={"mass": np.ones(2)}).check_rows()
 
 
 def test_blocks_without_entries_are_left_out():
@@ -116,12 +275,23 @@ MISFITS = {
     "column_number_too_large": (in_mass(matrix=csr(np.ones((N, N + 1)))), "matrix: a column number is outside"),
     "compressed_columns": (in_mass(matrix=Transposed), "expected compressed rows"),
     "unknown_columns": (in_mass(columns={"mass": range(N)}), "columns are given for mass; rows for intf_flow, mass"),
-    "entry_given_twice": (
-        in_mass(matrix=CSR(np.arange(N + 1) * 2, np.repeat(np.arange(N), 2), np.ones(2 * N))),
-        "columns of a row must increase, without duplicates",
+    "rectangular": (in_mass(matrix=np.ones((N, N + 3))), "matrix: has 12 rows and 15 columns, and must be square"),
+    "one_dimension": (in_mass(matrix=np.ones(N)), "expected compressed rows .* or a dense array .*, found ndarray"),
+    "lists_of_different_lengths": (in_mass(matrix=[[1.0], [2.0, 3.0]]), "found list"),
+    "no_matrix": (in_mass(matrix=object()), "found object"),
+    "fractional_columns": (in_mass(matrix=csr(np.eye(N))._replace(indices=np.arange(N) + 0.5)), "must be integers"),
+    "values_missing": (
+        in_mass(matrix=csr(np.eye(N))._replace(data=np.ones(3))),
+        "matrix: indptr ends at 12, but there",
     ),
-    "complex_matrix": (in_mass(matrix=csr(1j * np.eye(N))), "matrix or rhs is complex"),
-    "complex_rhs": (in_mass(rhs=np.full(N, 1j)), "matrix or rhs is complex"),
+    "complex_matrix": (in_mass(matrix=csr(1j * np.eye(N))), "matrix is complex; a scene is real"),
+    "complex_dense_matrix": (in_mass(matrix=1j * np.eye(N)), "matrix is complex"),
+    "complex_rhs": (in_mass(rhs=np.full(N, 1j)), "rhs is complex"),
+    "rhs_of_words": (in_mass(rhs=["one"] * N), "rhs is not made of numbers"),
+    "fractional_rows": (in_mass(fields={"mass": np.arange(N) + 0.5}), "mass: row numbers must be integers"),
+    "rows_of_words": (in_mass(fields={"mass": "all"}), "mass: row numbers must be integers"),
+    "rows_not_finite": (in_mass(fields={"mass": [*range(N - 1), np.nan]}), "mass: row numbers must be integers"),
+    "short_mask": (in_mass(fields={"mass": np.ones(N - 1, dtype=bool)}), r"a mask has shape \(11,\), expected \(12,\)"),
     "unfit_attribute": (in_mass(cell_volumes={"mass": np.ones(5)}), r"mass: cell_volumes has shape \(5,\)"),
 }
 
@@ -283,7 +453,7 @@ INVALID = {
     "cell_dimension_length": (lambda: replace(PLAIN, cell_dimension=np.zeros(5)), r"cell_dimension has shape \(5,\)"),
     "material_length": (
         lambda: replace(PLAIN, material=replace(PLAIN.material, porosity=np.ones(7))),
-        r"mass: porosity has shape \(7,\), expected \(6,\)",
+        r"material: porosity has shape \(7,\), expected \(6,\)",
     ),
 }
 
@@ -382,3 +552,18 @@ def test_a_part_cannot_be_cut_again():
 
 def test_contact_states_are_counted_by_name():
     assert contact_state_counts([2, 0, 0, 2, 2]) == {"sticking": 2, "sliding": 0, "open": 3}
+
+
+def test_importing_the_package_initialises_nothing():
+    program = """
+import sys, petsc_fs
+assert petsc_fs.__version__
+assert not {"h5py", "numpy", "petsc4py", "petsc4py.PETSc", "mpi4py.MPI", "porepy"} & set(sys.modules)
+from petsc_fs import Scene, hdf5, options, sequence
+assert not {"petsc4py.PETSc", "porepy", "scipy"} & set(sys.modules)
+import petsc_fs.io.hdf5, petsc_fs.io.sequence, petsc_fs.scene, petsc_fs.solver
+assert (hdf5, sequence) == (petsc_fs.io.hdf5, petsc_fs.io.sequence)
+assert (Scene, petsc_fs.Solver) == (petsc_fs.scene.Scene, petsc_fs.solver.Solver)
+assert not hasattr(petsc_fs, "nothing")
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)

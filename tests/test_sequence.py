@@ -1,9 +1,6 @@
-"""Sequences: files that hold many steps, and their replay; the runs they come from are in test_run.py."""
+"""Sequences: files that hold many steps; their replay is in test_replay.py, the runs they come from in test_run.py."""
 
-import json
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -11,9 +8,6 @@ import pytest
 from mpi4py import MPI
 from sample import CELLS, SCENES, assert_same, full_scene
 
-from petsc_fs import tree
-from petsc_fs.cli import main as cli
-from petsc_fs.cli.replay import Player
 from petsc_fs.errors import SceneError, UsageError
 from petsc_fs.io import hdf5, sequence
 from petsc_fs.io.sequence import Writer
@@ -222,150 +216,3 @@ def test_choice_of_steps(text, expected):
 def test_choices_of_steps_that_are_none(text):
     with pytest.raises(UsageError, match=r"^steps: "):
         sequence.parse_steps(text, 4)
-
-
-# Replay
-
-
-@pytest.mark.mpi
-def test_replay_needs_as_many_iterations_as_the_run(clean, monkeypatch):
-    """The run was on one rank, by the published file; on more, the multigrid of hypre is another one."""
-    monkeypatch.setattr(tree, "CANONICAL", "contact_poromechanics.opts")
-    player = Player(BUNDLED, MPI.COMM_WORLD, smallest_tree=True)
-    records = [player.play(step) for step in sequence.read_contents(BUNDLED).steps]
-    assert all(record["converged"] for record in records)
-    slack = 1 if MPI.COMM_WORLD.size == 1 else 5  # for other versions of PETSc and hypre
-    for record in records:
-        assert abs(record["iterations"] - record["iterations_in_run"]) <= slack
-    player.solver.destroy()
-
-
-@pytest.mark.mpi
-def test_replay_keeps_its_solver_and_finds_the_solution_of_each_step(clean):
-    from petsc_fs.solver import Solver
-
-    comm = MPI.COMM_WORLD
-    player = Player(BUNDLED, comm, smallest_tree=True)
-    kept = set()
-    for step in sequence.read_contents(BUNDLED).steps:
-        player.play(step)
-        kept.add(id(player.solver))
-        found = player.solver.system.gather(player.result.solution)
-        alone = Solver(sequence.read(BUNDLED, step.index), comm)
-        expected = alone.system.gather(alone.solve().solution)
-        alone.destroy()
-        if comm.rank == 0:
-            for field, values in expected.items():
-                assert np.linalg.norm(found[field] - values) < 1e-5 * np.linalg.norm(values), (step.index, field)
-    assert len(kept) == 1
-    player.solver.destroy()
-
-
-def test_steps_of_another_size_get_another_solver(clean, tmp_path):
-    writer = Writer(tmp_path / "two.h5")
-    for name in ("flow.h5", "contact.h5", "flow.h5"):
-        writer.append(hdf5.read(SCENES / name))
-    player = Player(writer.finish(), MPI.COMM_WORLD, smallest_tree=True)
-    records = [player.play(step) for step in sequence.read_contents(player.path).steps]
-    assert [record["unknowns"] for record in records] == [
-        sum(hdf5.read_sizes(SCENES / name)[1].values()) for name in ("flow.h5", "contact.h5", "flow.h5")
-    ]
-    for record in records:
-        assert max(record["error_by_field"].values()) < 1e-4
-    player.solver.destroy()
-
-
-def test_the_tolerance_of_an_inexact_run_is_replayed(clean, tmp_path):
-    writer = Writer(tmp_path / "inexact.h5")
-    scene = sequence.read(BUNDLED, 0)
-    for run in ({}, {"forcing": 1e-2}, {"forcing": 1e-12}):
-        writer.append(scene, run)
-    player = Player(writer.finish(), MPI.COMM_WORLD, smallest_tree=True)
-    exact, inexact, at_least = (player.play(step) for step in sequence.read_contents(player.path).steps)
-    assert inexact["iterations"] < exact["iterations"] == at_least["iterations"]
-    assert 1e-10 < inexact["true_relative_residual"] < 1e-2
-    player.solver.destroy()
-
-
-# The command line, in this process: what it does before it needs PETSc, or with PETSc's options as they are
-
-
-def call(capsys, *arguments, code=0):
-    """Output of `petsc-fs`."""
-    assert cli.main([str(word) for word in arguments]) == code
-    captured = capsys.readouterr()
-    return captured.out if code == 0 else captured.err
-
-
-def test_solve_replays_and_reports(clean, capsys, tmp_path):
-    out = call(capsys, "solve", "model2_run.h5", "--report", tmp_path / "r.json")
-    report = json.loads((tmp_path / "r.json").read_text())
-    contents = sequence.read_contents(BUNDLED)
-    assert report["converged"]
-    assert [record["step"] for record in report["steps"]] == [step.index for step in contents.steps]
-    assert report["totals"]["iterations"] == sum(record["iterations"] for record in report["steps"])
-    assert (report["model"], report["complete"]) == ("model2", True)
-    assert f"{len(contents.steps)} of {len(contents.steps)} steps: all converged" in out
-    assert "in run" in out
-
-
-def test_solve_of_one_step_saves_its_solution(clean, capsys, tmp_path):
-    call(capsys, "solve", "model2_run.h5", "--steps", "1", "--save", tmp_path / "x.h5")
-    with h5py.File(tmp_path / "x.h5") as file:
-        assert {name: values.size for name, values in file.items()} == sequence.read_contents(BUNDLED).steps[1].sizes
-        assert file.attrs["newton_index"] == 1
-
-
-def test_inspect(capsys):
-    out = call(capsys, "inspect", "model2_run.h5")
-    assert "model2_run.h5: model2, 4 steps" in out
-    assert "fields: contact 62" in out
-    assert "time step 1, Newton step 2" in call(capsys, "inspect", "model2_run.h5", "--step", 2)
-
-
-def test_inspect_says_that_a_sequence_is_incomplete(scenes, capsys, tmp_path):
-    writer = Writer(tmp_path / "some.h5")
-    writer.append(scenes[0])
-    assert "incomplete: the run that wrote it was interrupted or failed" in call(capsys, "inspect", writer.abandon())
-
-
-def test_convert_takes_a_step_out(capsys, tmp_path):
-    call(capsys, "convert", "model2_run.h5", tmp_path / "step.h5", "--step", 3)
-    assert_same(sequence.read(BUNDLED, 3), hdf5.read(tmp_path / "step.h5"))
-
-
-@pytest.fixture
-def empty_folder(tmp_path, monkeypatch):
-    """The working directory."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "message"),
-    [
-        (["solve", "model2_run.h5", "--steps", "9"], 2, "steps: 9 names none of the steps 0 to 3"),
-        (["solve", "model2_run.h5", "--steps", "x"], 2, "steps: cannot read 'x'"),
-        (["solve", "flow.h5", "--steps", "0"], 2, "flow.h5 is no sequence"),
-        (["solve", "model2_run.h5", "--save", "x.h5"], 2, "--save: writes the solution of one step"),
-        (["solve", "model2_run.h5", "--report", "nowhere/r.json"], 2, "nowhere/r.json: the folder"),
-        (["solve", "model2_run.h5", "-options_file", "flow.opts"], 2, "flow.opts is for scenes with the fields"),
-        (["inspect", "model2_run.h5", "--step", "4"], 3, "there is no step 4; steps are 0 to 3"),
-        (["inspect", "flow.h5", "--step", "0"], 2, "flow.h5 is no sequence"),
-        (["inspect", "model2_run.h5", "--plot", "x.png"], 2, "choose it with --step K"),
-        (["options", "model2_run.h5"], 3, "a sequence of scenes, and one is needed"),
-        (["convert", "model2_run.h5", "x.h5"], 3, "a sequence of scenes, and one is needed"),
-        (["convert", "model2_run.h5", "x", "--step", "0"], 2, "x: a step becomes a scene, whose name ends in .h5"),
-        (["convert", "flow.h5", "x.h5", "--step", "0"], 3, "not a petsc_fs sequence"),
-    ],
-)
-def test_errors_are_one_line_and_leave_no_file(capsys, empty_folder, arguments, code, message):
-    error = call(capsys, *arguments, code=code)
-    assert message in error
-    assert error.startswith("petsc-fs: ")
-    assert error.count("\n") == 1
-    assert not os.listdir(empty_folder)
-
-
-def test_the_bundled_sequence_is_found_by_name():
-    assert cli.find_scene("model2_run.h5") == Path(BUNDLED)

@@ -23,8 +23,7 @@ from tests.sample import SCENES
 
 pytest.importorskip("yaml")
 optuna = pytest.importorskip("optuna")
-from petsc_fs.tools.sweep import Settings, Sweep, aggregate, front, judge  # noqa: E402
-from petsc_fs.tools.sweep_report import write  # noqa: E402
+from petsc_fs.tools.sweep import Settings, Sweep, aggregate, front, judge, write  # noqa: E402
 
 FLOW = SCENES / "flow.h5"
 HERE = Path(__file__).parent
@@ -39,7 +38,6 @@ BASE = """\
 -ksp_type gmres  # any
 -ksp_rtol 1e-8
 -ksp_pc_side right
--petsc_fs_mat_type aij
 -prefix_push pc_
   -type asm
 -prefix_pop
@@ -221,9 +219,8 @@ def record(seconds: float = 1.0, **more: Any) -> measure.Record:
     return measure.EMPTY | {
         "kind": "converged",
         "message": "",
-        "setup_seconds": seconds / 2,
-        "solve_seconds": seconds / 2,
-        "cpu_seconds": 2 * seconds,
+        "seconds": {"setup": seconds / 2, "solve": seconds / 2},
+        "cpu_seconds": {"setup": seconds, "solve": seconds},
         "iterations": 7,
         "peak_rss": [300],
         "base_rss": [100],
@@ -248,8 +245,8 @@ def made_up(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[tuple[str, st
             calls.append((Path(scene).name, Path(str(job.options_file)).name))
             found = measured(options.parse(Path(str(job.options_file))))
             if found["kind"] == "slow":
-                return [record(kind="hang", message=f"no result within {job.time_limit:g} s")]
-            return [found] * job.repetitions
+                return [record(scene=scene, kind="hang", message=f"no result within {job.time_limit:g} s")]
+            return [found | {"scene": scene}] * job.repetitions
 
         monkeypatch.setattr(measure, "measure", fake)
         monkeypatch.setattr(Sweep, "_reference", lambda sweep, scene: None)
@@ -275,7 +272,7 @@ def by_restart(chosen: dict[str, str | None]) -> measure.Record:
     return record(restart / 30, peak_rss=[100 + 6000 // restart])
 
 
-@pytest.mark.parametrize("sampler", ["tpe", "random", "nsga2"])
+@pytest.mark.parametrize("sampler", ["tpe", "random"])
 def test_sampled_trials_respect_conditions_and_end_as_measured(tmp_path: Path, made_up: Any, sampler: str) -> None:
     made_up(by_restart)
     results = Sweep(settings(tmp_path, sampler=sampler, trials=40)).run()
@@ -294,7 +291,7 @@ def test_sampled_trials_respect_conditions_and_end_as_measured(tmp_path: Path, m
 
 def test_grid_measures_every_point_once_and_then_stops(tmp_path: Path, made_up: Any) -> None:
     calls = made_up(by_restart)
-    results = Sweep(settings(tmp_path, sampler="grid", trials=500, confirm=1, finalists=1, base_every=1000)).run()
+    results = Sweep(settings(tmp_path, sampler="grid", trials=500, confirm=1, finalists=1)).run()
     assert len(results["trials"]) == 85
     trials = [file for _, file in calls if file != "base.opts"]
     assert len(trials) == len(set(trials)) + 1  # the finalist
@@ -305,13 +302,13 @@ def test_grid_measures_every_point_once_and_then_stops(tmp_path: Path, made_up: 
 def test_same_options_are_not_measured_again(tmp_path: Path, made_up: Any) -> None:
     calls = made_up(by_restart)
     text = "base: base.opts\ngroups: {a: {parameters: {ksp_type: {choices: [gmres, fgmres]}}}}"
-    more = {"space": make(tmp_path, text), "trials": 9, "confirm": 1, "finalists": 1, "base_every": 100}
+    more = {"space": make(tmp_path, text), "trials": 9, "confirm": 1, "finalists": 1}
     results = Sweep(Settings(scenes=(SCENE_A,), out=tmp_path / "out", sampler="random", **more)).run()
     measured = [t for t in results["trials"] if t["same_as"] is None]
     assert len(results["trials"]) == 9
     assert len(measured) == 2
     assert len([file for _, file in calls if file != "base.opts"]) == 3
-    assert len(results["front"]) == 2 or {t["totals"]["time"]["mean"] for t in measured} == {1.0}
+    assert len(results["front"]) == 2 or {t["totals"]["time"] for t in measured} == {1.0}
 
 
 def test_scenes_are_aggregated_and_held_out_ones_come_last(tmp_path: Path, made_up: Any) -> None:
@@ -350,7 +347,7 @@ def test_hopelessly_slow_trials_are_pruned(tmp_path: Path, made_up: Any) -> None
     results = Sweep(settings(tmp_path, sampler="random", patience=4.0)).run()
     pruned = [t for t in results["trials"] if t["outcome"] == "pruned"]
     assert pruned
-    assert re.search(r"within [\d.]+ s, that is 4 times what the front or the base file takes", pruned[0]["message"])
+    assert re.search(r"within [\d.]+ s, that is 4 times what the base file takes", pruned[0]["message"])
     results = Sweep(settings(tmp_path, sampler="random", patience=0.0, out=tmp_path / "b", time_limit=50.0)).run()
     assert {t["message"] for t in results["trials"] if t["outcome"] == "hang"} == {"no result within 50 s"}
 
@@ -397,7 +394,7 @@ from tests.test_sweep import by_restart, options, settings
 
 def slow(job, *, mpiexec=None):
     time.sleep(0.15)
-    return [by_restart(options.parse(Path(job.options_file)))]
+    return [by_restart(options.parse(Path(job.options_file))) | {"scene": job.scenes[0]}]
 
 measure.measure = slow
 sweep.Sweep._reference = lambda self, scene: None
@@ -445,7 +442,7 @@ def test_trial_that_was_measured_but_not_ended_is_not_repeated(
     tmp_path: Path, made_up: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls = made_up(by_restart)
-    some = settings(tmp_path, sampler="random", trials=5, finalists=1, confirm=1, base_every=100)
+    some = settings(tmp_path, sampler="random", trials=5, finalists=1, confirm=1)
     with monkeypatch.context() as patch:
         tell = Sweep._tell
 
@@ -480,6 +477,11 @@ def test_two_sweeps_in_a_folder_do_not_mix(tmp_path: Path, made_up: Any) -> None
 
 # --- searches in earnest
 
+FAULTY_BASE = BASE.replace(
+    "-prefix_push", "-pc_type python\n-pc_python_type petsc_fs.pc.Assembled\n-prefix_push assembled_\n-prefix_push"
+)
+FAULTY_BASE = FAULTY_BASE + "-prefix_pop\n"
+
 FAULTY = """\
 base: base.opts
 groups:
@@ -487,15 +489,18 @@ groups:
     parameters:
       which:
         choices:
-          good: {sub_pc_factor_levels: 1}
-          diverging: {pc_type: python, pc_python_type: tests.faulty.Growing, ksp_type: richardson, ksp_divtol: 1e3,
-                      ksp_pc_side: ~, sub_ksp_type: ~, sub_pc_type: ~}
+          good: {assembled_sub_pc_factor_levels: 1}
+          diverging: {pc_python_type: tests.faulty.Growing, ksp_type: richardson, ksp_max_it: 3, ksp_pc_side: ~,
+                      assembled_pc_type: ~, assembled_sub_ksp_type: ~, assembled_sub_pc_type: ~}
           stagnating: {ksp_max_it: 1}
-          crashing: {pc_type: python, pc_python_type: tests.faulty.Crashing, sub_ksp_type: ~, sub_pc_type: ~}
-          hanging: {pc_type: python, pc_python_type: tests.faulty.Hanging, sub_ksp_type: ~, sub_pc_type: ~}
-          hungry: {pc_type: python, pc_python_type: tests.faulty.Hungry, sub_ksp_type: ~, sub_pc_type: ~}
-          misspelt: {sub_pc_factor_levles: 1}
-          impossible: {sub_pc_type: iul}
+          crashing: {pc_python_type: tests.faulty.Crashing, assembled_pc_type: ~, assembled_sub_ksp_type: ~,
+                     assembled_sub_pc_type: ~}
+          hanging: {pc_python_type: tests.faulty.Hanging, assembled_pc_type: ~, assembled_sub_ksp_type: ~,
+                    assembled_sub_pc_type: ~}
+          hungry: {pc_python_type: tests.faulty.Hungry, assembled_pc_type: ~, assembled_sub_ksp_type: ~,
+                   assembled_sub_pc_type: ~}
+          misspelt: {assembled_sub_pc_factor_levles: 1}
+          impossible: {assembled_sub_pc_type: iul}
 """
 
 EXPECTED = {
@@ -514,32 +519,33 @@ def test_each_way_to_fail_is_recorded_as_what_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", str(HERE.parent))
-    make(tmp_path, FAULTY)
+    make(tmp_path, FAULTY, FAULTY_BASE)
     out = tmp_path / "out"
     arguments = ["sweep", "flow.h5", "--space", str(tmp_path / "some.yaml"), "--sampler", "grid", "--trials", "20"]
     arguments += ["--patience", "0", "--time-limit", "10", "--memory-limit", "4", "--finalists", "1", "--confirm", "1"]
-    arguments += ["--base-every", "100", "--out", str(out), "--page", str(tmp_path / "page.md")]
+    arguments += ["--out", str(out), "--page", str(tmp_path / "page.md")]
     assert main(arguments) == 0
     results = json.loads((out / "sweep.json").read_text())
     assert {t["values"]["all.which"]: t["outcome"] for t in results["trials"]} == EXPECTED
     said = {t["values"]["all.which"]: t["message"] for t in results["trials"]}
-    assert "sub_pc_factor_levels" in said["misspelt"]  # what it might have meant
+    assert "assembled_sub_pc_factor_levels" in said["misspelt"]  # what it might have meant
     assert "SIGSEGV" in said["crashing"]
     assert "within 10 s" in said["hanging"]
     assert results["outcomes"] == dict.fromkeys(EXPECTED.values(), 1)
 
+    assert main(["lint", str(out / "best.opts")]) == 0
     header = options.read_header(out / "best.opts")
     assert header.fields == ("intf_flow", "mass")
     assert not header.default
-    assert options.parse(out / "best.opts") == options.parse(tmp_path / "base.opts") | {"sub_pc_factor_levels": "1"}
+    assert options.parse(out / "best.opts") == options.parse(tmp_path / "base.opts") | {
+        "assembled_sub_pc_factor_levels": "1"
+    }
     for page in (out / "report.md", tmp_path / "page.md"):
         text = page.read_text()
-        assert "`petsc-fs lint best.opts` has no complaint." in text
         assert all(kind in text for kind in EXPECTED.values())
         picture = re.search(r"!\[.*\]\((.*)\)", text)
         assert picture is not None
         assert (page.parent / picture[1]).stat().st_size > 1000
-    assert (out / "trials.csv").read_text().count("\n") == 1 + len(EXPECTED)
     command = [sys.executable, "-m", "petsc_fs", "solve", "flow.h5", "-options_file", str(out / "best.opts")]
     assert subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode == 0
 
@@ -553,7 +559,7 @@ def test_results_without_a_solved_trial_are_written_all_the_same(tmp_path: Path,
     results = Sweep(some).run()
     assert results["final"] is None
     written = write(results, some.out)
-    assert {p.name for p in written} == {"trials.csv", "sweep.json", "report.md"}
+    assert {p.name for p in written} == {"sweep.json", "report.md"}
     assert r"SIGFPE \| in \| set-up" in (some.out / "report.md").read_text()
 
 

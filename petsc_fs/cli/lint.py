@@ -9,7 +9,6 @@ from pathlib import Path
 from petsc_fs import options
 from petsc_fs.errors import PetscFsError, UsageError
 from petsc_fs.io import hdf5
-from petsc_fs.levels import levels
 
 
 def lint(file: Path, scenes: Sequence[Path]) -> list[str]:
@@ -29,17 +28,19 @@ def lint(file: Path, scenes: Sequence[Path]) -> list[str]:
         chosen = options.parse(file)
     except UsageError as e:
         return [str(e)]
+    try:
+        options.check(chosen)
+    except UsageError as e:
+        return [f"{file}: {e}"]
     header = options.read_header(file)
     scene = next((s for s in scenes if header.fits(hdf5.read_sizes(s)[1])), None)
     if scene is None:
         raise UsageError(f"{file}: none of the scenes has the fields {', '.join(header.fields)}; name one")
 
-    import petsc4py
-
-    petsc4py.init(["petsc-fs"])
+    options.Given.of(["-options_file", str(file)]).start()
+    from petsc_fs.nest import levels
     from petsc_fs.solver import Solver
 
-    options.insert_all(chosen)
     found = [f"{file}: {problem}" for problem in _levels_without_types(chosen)]
     try:
         solver = Solver(hdf5.read(scene))

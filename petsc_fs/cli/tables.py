@@ -1,24 +1,21 @@
-"""Text that people read: tables of the command line, made with rich."""
+"""Text that people read: tables in plain characters, for 80 columns."""
 
 from __future__ import annotations
 
-import io
+import textwrap
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 
 from petsc_fs import memory
 from petsc_fs.fields import FIELD
 from petsc_fs.scene import Scene, contact_state_counts
-from petsc_fs.tools.contraction import FORMULAS, Contraction, summary
 
 if TYPE_CHECKING:
     from petsc_fs.io.sequence import Contents
 
-WIDTH = 100
+WIDTH = 80
 RUN_PHASES = {
     "transfer": "transfer to and from PETSc",
     "setup": "set-up of the preconditioner",
@@ -30,148 +27,148 @@ RUN_PHASES = {
 PHASES = (("read", "read_seconds"), ("set-up", "setup_seconds"), ("solve", "solve_seconds"))
 
 
-def solve_table(scene: Scene, report: dict[str, Any]) -> str:
-    """One table on a solve: fields, sizes, residuals and errors, and below what it took."""
-    errors = report["error_by_field"]
-    table = Table()
-    for heading in ("field", "unknowns", "true residual", *(["error"] if errors else [])):
-        table.add_column(heading, justify="left" if heading == "field" else "right")
-    for name, size in report["fields"].items():
-        row = [name, f"{size:,}", f"{report['residual_by_field'][name]:.2e}"]
-        table.add_row(*row, *([f"{errors[name]:.2e}"] if errors else []))
-    table.add_section()
-    total = [f"{sum(report['fields'].values()):,}", f"{report['true_relative_residual']:.2e}"]
-    table.add_row("all", *total, *([""] if errors else []))
-    verdict = "converged" if report["converged"] else "NOT CONVERGED"
-    if report["limited_by_rounding"]:
-        verdict += ", to the limit of rounding"
+def table(headings: Sequence[str], rows: Iterable[Sequence[object]], left: str = "0") -> str:
+    """Columns under headings, to the right but for those whose numbers are in `left`; an empty row is a rule."""
+    texts = [[str(cell) for cell in row] for row in (headings, *rows)]
+    used = [k for k in range(len(headings)) if any(row[k] for row in texts if row)]
+    widths = {k: max(len(row[k]) for row in texts if row) for k in used}
+
+    def line(row: Sequence[str]) -> str:
+        cells = (row[k].ljust(widths[k]) if str(k) in left else row[k].rjust(widths[k]) for k in used)
+        return "  ".join(cells).rstrip()
+
+    rule = "-" * (sum(widths.values()) + 2 * len(used) - 2)
+    return "\n".join([line(texts[0]), rule, *(line(row) if row else rule for row in texts[1:])])
+
+
+def wrapped(lines: Iterable[str]) -> str:
+    """Lines, each broken where it is too long."""
+    return "\n".join(textwrap.fill(line, WIDTH, subsequent_indent="  ", break_on_hyphens=False) for line in lines)
+
+
+def solve_table(report: dict[str, Any]) -> str:
+    """One table on a solve: fields, sizes, residuals and errors, and below the verdict and what it took."""
+    residuals, backward, errors = (
+        report.get(f"{name}_by_field") or {} for name in ("residual", "backward_error", "error")
+    )
+    estimates = {} if errors else report.get("estimated_error_by_field") or {}
+    rows: list[Sequence[object]] = [
+        (f, f"{n:,}", *(_number(found.get(f)) for found in (residuals, backward, errors or estimates)))
+        for f, n in report["fields"].items()
+    ]
+    total = sum(report["fields"].values())
+    rows += [(), ("all", f"{total:,}", _number(report["true_relative_residual"]), "", "")]
+    headings = [
+        "field",
+        "unknowns",
+        "residual",
+        "backward error",
+        "error" if errors else "error, estimated" if estimates else "",
+    ]
+    source = report["options_file"] or "the smallest solver for the scene"
     lines = [
-        f"{verdict}: true residual {report['true_relative_residual']:.2e}, tolerance {report['tolerance']:.2e}",
-        f"{report['iterations']} iterations ({report['reason']}) by "
-        f"{report['options_file'] or 'the smallest solver for the scene'}"
-        f" on {report['ranks']} rank{'s' if report['ranks'] > 1 else ''}",
+        report["verdict"],
+        f"{report['iterations']} iterations ({report['reason']}) by {source}{_on(report['ranks'])}",
         *report["left_out"],
         *report.get("notes", ()),
-        ", ".join(f"{what} {report[key]:.3f} s" for what, key in PHASES),
+        _seconds(report),
         memory.text(report["memory_bytes"]),
     ]
-    return "\n".join([_title(scene, report["scene"]), _text(table) + "\n".join(lines)])
+    return "\n".join([wrapped([_title(report, report["scene"])]), "", table(headings, rows), "", wrapped(lines)])
+
+
+def sequence_table(report: dict[str, Any]) -> str:
+    """One row per step of a sequence that was solved, and below what all of it took."""
+    records = report["steps"]
+    rows = [
+        (
+            *(record[name] for name in ("step", "time_step_index", "newton_index")),
+            f"{record['iterations']}{'' if record['converged'] else ' !'}",
+            "" if record["iterations_in_run"] is None else record["iterations_in_run"],
+            *(_number(record["true_relative_residual"]), f"{record['setup_seconds']:.3f}"),
+            *(f"{record['solve_seconds']:.3f}", "/".join(map(str, record["contact_states"].values()))),
+        )
+        for record in records
+    ]
+    known = any(row[4] != "" for row in rows)
+    contact = any(row[-1] for row in rows)
+    headings = ["step", "time", "Newton", "Krylov", "in run" if known else "", "residual", "set-up s", "solve s"]
+    missed = [record for record in records if not record["converged"]]
+    source = report["options_file"] or "the smallest solver for the sequence"
+    lines = [
+        f"{len(records)} of {report['steps_in_sequence']} steps: "
+        + (f"{len(missed)} NOT CONVERGED (!)" if missed else "all converged"),
+        *(f"step {record['step']}: {record['verdict']}" for record in missed),
+        f"{report['totals']['iterations']} iterations by {source}{_on(report['ranks'])}",
+        *report["left_out"],
+        _seconds(report["totals"]),
+        memory.text(report["memory_bytes"]),
+    ]
+    body = table([*headings, "st./sl./open" if contact else ""], rows, left="")
+    return "\n".join([wrapped([f"{report['sequence']}: {report['model']}"]), "", body, "", wrapped(lines)])
 
 
 def run_table(summary: dict[str, Any]) -> str:
     """What a run of a model took, by phase."""
     seconds = summary["seconds"]
-    table = Table()
-    table.add_column("phase")
-    table.add_column("seconds", justify="right")
-    table.add_column("share", justify="right")
+    rows: list[Sequence[object]] = []
     for name, value in seconds.items():
-        if name == "total":
-            table.add_section()
-        table.add_row(RUN_PHASES.get(name, name), f"{value:.2f}", f"{100 * value / (seconds['total'] or 1):.0f} %")
-    newton, ranks, missed = summary["newton_steps"], summary["ranks"], summary["not_converged"]
+        share = f"{100 * value / (seconds['total'] or 1):.0f} %"
+        rows += [*([()] if name == "total" else []), (RUN_PHASES.get(name, name), f"{value:.2f}", share)]
+    newton, missed = summary["newton_steps"], summary["not_converged"]
     per_step = summary["iterations"] / (newton or 1)
     states = ", ".join(f"{n} {state}" for state, n in summary["contact_states"].items())
+    cuts = f" ({summary['time_step_cuts']} cut)" if summary["time_step_cuts"] else ""
     lines = [
-        f"{summary['time_steps']} time steps"
-        + (f" ({summary['time_step_cuts']} cut)" if summary["time_step_cuts"] else "")
-        + f", {newton} Newton steps, {summary['iterations']} Krylov iterations ({per_step:.1f} per Newton step)"
-        + f" on {ranks} rank{'s' if ranks > 1 else ''}",
+        f"{summary['time_steps']} time steps{cuts}, {newton} Newton steps, {summary['iterations']} Krylov iterations"
+        f" ({per_step:.1f} per Newton step){_on(summary['ranks'])}",
         *([f"{missed} linear solves did NOT CONVERGE"] if missed else []),
         *([f"contact at the last Newton step: {states}"] if states else []),
         *summary["notes"],
         f"written to {summary['folder']}: {', '.join(summary['files'])}",
     ]
     unknowns = f" ({summary['unknowns']:,} unknowns)" if summary["unknowns"] else ""
-    return "\n".join([f"{summary['model']}{unknowns}", _text(table) + "\n".join(lines)])
+    body = table(["phase", "seconds", "share"], rows)
+    return "\n".join([f"{summary['model']}{unknowns}", "", body, "", wrapped(lines)])
 
 
-def replay_table(report: dict[str, Any]) -> str:
-    """One row per step of a replayed sequence, and below what all of it took."""
-    records = report["steps"]
-    known = any(record["iterations_in_run"] is not None for record in records)
-    table = Table()
-    numbers = ("step", "time", "Newton", "Krylov", *(["in run"] if known else []))
-    for heading in (*numbers, "true residual", "set-up s", "solve s"):
-        table.add_column(heading, justify="right")
-    contact = any(record["contact_states"] for record in records)
-    table.add_column("st./sl./open" if contact else "", justify="right")
-    for record in records:
-        in_run = record["iterations_in_run"]
-        table.add_row(
-            str(record["step"]),
-            str(record["time_step_index"]),
-            str(record["newton_index"]),
-            str(record["iterations"]) + ("" if record["converged"] else " !"),
-            *(["" if in_run is None else str(in_run)] if known else []),
-            f"{record['true_relative_residual']:.2e}",
-            f"{record['setup_seconds']:.3f}",
-            f"{record['solve_seconds']:.3f}",
-            "/".join(map(str, record["contact_states"].values())),
-        )
-    missed = sum(not record["converged"] for record in records)
-    totals, ranks = report["totals"], report["ranks"]
-    lines = [
-        f"{len(records)} of {report['steps_in_sequence']} steps: "
-        + (f"{missed} NOT CONVERGED (!)" if missed else "all converged"),
-        f"{totals['iterations']} iterations by {report['options_file'] or 'the smallest solver for the sequence'}"
-        f" on {ranks} rank{'s' if ranks > 1 else ''}",
-        *report["left_out"],
-        ", ".join(f"{what} {totals[key]:.3f} s" for what, key in PHASES),
-    ]
-    return "\n".join([f"{report['sequence']}: {report['model']}", _text(table) + "\n".join(lines)])
-
-
-def sequence_table(name: str, contents: Contents) -> str:
+def contents_table(name: str, contents: Contents) -> str:
     """The steps of a sequence."""
-    table = Table()
-    for heading in ("step", "time", "Newton", "unknowns", "entries", "Krylov in the run"):
-        table.add_column(heading, justify="right")
-    contact = any(step.contact_states for step in contents.steps)
-    table.add_column("st./sl./open" if contact else "", justify="right")
-    for step in contents.steps:
-        table.add_row(
-            str(step.index),
-            str(step.time_step_index),
-            str(step.newton_index),
-            f"{sum(step.sizes.values()):,}",
-            f"{step.entries:,}",
-            str(step.run.get("iterations", "")),
-            "/".join(map(str, step.contact_states.values())),
+    rows = [
+        (
+            *(step.index, step.time_step_index, step.newton_index, f"{sum(step.sizes.values()):,}"),
+            *(f"{step.entries:,}", step.run.get("iterations", ""), "/".join(map(str, step.contact_states.values()))),
         )
-    fields = ", ".join(f"{field} {size:,}" for field, size in contents.steps[0].sizes.items())
+        for step in contents.steps
+    ]
+    headings = ["step", "time", "Newton", "unknowns", "entries", "Krylov in the run"]
+    body = table([*headings, "st./sl./open" if any(row[-1] for row in rows) else ""], rows, left="")
     lines = [
-        f"fields: {fields}",
+        "fields: " + ", ".join(f"{field} {size:,}" for field, size in contents.steps[0].sizes.items()),
         *([] if contents.complete else ["incomplete: the run that wrote it was interrupted or failed"]),
         "petsc-fs inspect --step K shows one step",
     ]
     count = len(contents.steps)
     title = f"{name}: {contents.model or 'sequence'}, {count} step{'s' if count > 1 else ''}"
-    return "\n".join([title, _text(table) + "\n".join(lines)])
+    return "\n".join([title, "", body, "", wrapped(lines)])
 
 
-def inspect_table(scene: Scene) -> str:
+def scene_table(scene: Scene) -> str:
     """Fields, blocks with their magnitudes, contact states and what is known beside the matrix."""
-    fields = Table()
-    for heading in ("field", "J_ij", "unknowns", "block size", "unknown", "equation", "|rhs|"):
-        fields.add_column(heading, justify="right" if heading in ("unknowns", "block size", "|rhs|") else "left")
-    for name in scene.fields:
-        field = FIELD[name]
-        fields.add_row(
-            name,
-            str(field.index),
-            f"{scene.sizes[name]:,}",
-            str(scene.block_size(name)),
-            field.unknown,
-            field.equation,
-            f"{np.linalg.norm(scene.rhs[name]):.1e}",
+    headings = ["field", "unknowns", "J_ij", "block", "|rhs|", "unknown", "equation"]
+    rows = [
+        (
+            *(name, f"{scene.sizes[name]:,}", FIELD[name].index, scene.block_size(name)),
+            *(f"{np.linalg.norm(scene.rhs[name]):.1e}", FIELD[name].unknown, FIELD[name].equation),
         )
-    blocks = Table()
-    blocks.add_column("")
-    for name in scene.fields:
-        blocks.add_column(name, justify="right")
+        for name in scene.fields
+    ]
+    # unknowns and equations are too long for the width
+    fields = [table(headings[:5], [row[:5] for row in rows]), *(f"{row[0]}: {row[5]}; {row[6]}" for row in rows)]
+    blocks: list[tuple[str, ...]] = []
     for r in scene.fields:
-        blocks.add_row(r, *(_block_text(scene, r, c) for c in scene.fields))
+        cells = [_block_text(scene, r, c) for c in scene.fields]
+        blocks += [(r, *(entries for entries, _ in cells)), ("", *(sizes for _, sizes in cells))]
     lines = []
     if scene.contact_state is not None:
         counts = contact_state_counts(scene.contact_state)
@@ -188,70 +185,34 @@ def inspect_table(scene: Scene) -> str:
     producers = ", ".join(f"{k} {v}" for k, v in scene.metadata.producers.items())
     lines.append("made by: " + (producers or "unknown"))
     heading = "entries of each block, and the least and greatest |a_ij|; '.' is an empty block"
-    return "\n".join([_title(scene, ""), _text(fields) + heading, _text(blocks) + "\n".join(lines)])
+    about = {"dimension": scene.dimension} | vars(scene.metadata)
+    matrix = table(["", *scene.fields], blocks)
+    return "\n".join([wrapped([_title(about, "")]), "", *fields, "", heading, matrix, "", wrapped(lines)])
 
 
-def contraction_table(found: Contraction) -> str:
-    """The terms of the convergence condition, which of them dominates, and what the scene does not meet."""
-    table = Table()
-    for heading in ("term", "formula", "cells", "least", "median", "greatest", "at (m)", "in theorem"):
-        table.add_column(heading, justify="left" if heading in ("term", "formula", "at (m)") else "right")
-    for name, formula in FORMULAS.items():
-        value = f"{found.theorem[name]:.1e}" if name in found.theorem else "not known"
-        table.add_row(name, formula, *_spread(found.terms.get(name), found), value)
-    lines = []
-    if found.demand is not None:
-        lines.append(f"sum of the terms: {found.demand:.2e} Pa/m")
-    if found.stiffness is not None:
-        lines.append("4 G D: between {:.2e} and {:.2e} Pa/m".format(*found.stiffness))
-    lines.append(f"condition: {found.verdict}" + (f"; {found.dominant} dominates" if found.dominant else ""))
-    if found.rate is not None:
-        lines.append(f"where it holds, every iteration reduces the error at least by the factor {found.rate:.3f}")
-    heading = "convergence condition of fixed stress: 4 G D ≥ sum of the terms, in Pa/m"
-    parts = [heading, _text(table) + "\n".join(lines)]
-    if found.slip.size:
-        violations = Table()
-        for heading in ("", "cells", "least", "median", "greatest", "at (m)"):
-            violations.add_column(heading, justify="left" if heading in ("", "at (m)") else "right")
-        for heading, values in (
-            ("slip of sticking cells, m", found.slip),
-            ("c slip / friction bound", found.slip_over_bound),
-            ("Coulomb mismatch ε of sliding cells, Pa", found.mismatch),
-            ("ε / |y|", found.mismatch_over_trial),
-        ):
-            violations.add_row(heading, *_spread(values, found))
-        parts += ["against its assumptions", _text(violations).rstrip("\n")]
-    return "\n".join([*parts, *(f"- {note}" for note in found.notes)])
-
-
-def _spread(values: NDArray[np.float64] | None, found: Contraction) -> tuple[str, ...]:
-    """Number of cells that have a value, least, median and greatest, and the place of the greatest."""
-    numbers = None if values is None else summary(values)
-    if values is None or numbers is None:
-        return ("0", "", "", "", "")
-    *sizes, cell = numbers
-    at = "" if found.centers is None else ", ".join(f"{x:.0f}" for x in found.centers[cell])
-    return (str(np.count_nonzero(~np.isnan(values))), *(f"{x + 0.0:.1e}" for x in sizes), at)
-
-
-def _block_text(scene: Scene, r: str, c: str) -> str:
+def _block_text(scene: Scene, r: str, c: str) -> tuple[str, str]:
     block = scene.blocks.get((r, c))
     if block is None or not block.data.size:
-        return "."
+        return ".", ""
     sizes = np.abs(block.data)
     nonzero = sizes[sizes > 0]
     least = nonzero.min() if nonzero.size else 0.0
-    return f"{block.data.size:,}\n{least:.0e} .. {sizes.max():.0e}"
+    return f"{block.data.size:,}", f"{least:.0e}..{sizes.max():.0e}"
 
 
-def _title(scene: Scene, name: str) -> str:
-    meta = scene.metadata
-    step = f", time step {meta.time_step_index}, Newton step {meta.newton_index}" if meta.time_step_index >= 0 else ""
-    label = ": ".join(t for t in (name, meta.model or "scene") if t)
-    return f"{label} ({scene.dimension}D{step})"
+def _title(about: dict[str, Any], name: str) -> str:
+    step = f", time step {about['time_step_index']}, Newton step {about['newton_index']}"
+    label = ": ".join(t for t in (name, about["model"] or "scene") if t)
+    return f"{label} ({about['dimension']}D{step if about['time_step_index'] >= 0 else ''})"
 
 
-def _text(table: Table) -> str:
-    console = Console(file=io.StringIO(), width=WIDTH, color_system=None)
-    console.print(table)
-    return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.2e}"
+
+
+def _seconds(report: dict[str, Any]) -> str:
+    return ", ".join(f"{what} {report[key]:.3f} s" for what, key in PHASES)
+
+
+def _on(ranks: int) -> str:
+    return f" on {ranks} rank{'s' if ranks > 1 else ''}"

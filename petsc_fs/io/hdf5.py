@@ -10,33 +10,43 @@
     /material             time_step; datasets, or attributes where one number holds everywhere
 
 Rows and columns are numbered within their field, from 0; vector fields list all components of a
-cell before the next cell. What is unknown is left out.
+cell before the next cell. What is unknown is left out. A scene lies in one file, and all of it is written: no
+external links or storage, no virtual datasets, no chunks left to the fill value.
 """
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields as attributes
-from importlib.metadata import PackageNotFoundError, version
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import h5py
 import numpy as np
 
+from petsc_fs import __version__
+from petsc_fs.csr import whole_numbers
 from petsc_fs.errors import LayoutError, SceneError
 from petsc_fs.fields import FIELD, FIELD_NAMES, in_order
-from petsc_fs.io.files import complete
-from petsc_fs.scene import CSR, Floats, Material, Metadata, Scene
+from petsc_fs.io.files import check_regular, complete
+from petsc_fs.scene import CSR, Integers, Material, Metadata, Scene, check_order
 
 ENCODING = "petsc_fs scene"
 VERSION = 1
+T = TypeVar("T", str, int, float)
+LOCKS = "; wait for it (or HDF5_USE_FILE_LOCKING=FALSE where the file system has no locks)"
 HEAP = b"GCOL"
 HEAPS_WITHIN = 2**24
 """Bytes at the beginning of a file that are looked through for damaged heaps."""
+DEFLATE, SMALL = 1032, 2**26
+"""Bytes that one byte of a deflated file can become at most, and bytes below which nobody minds."""
+PER_ROW = ("rhs", "reference")
 PER_CELL = ("cell_centers", "cell_volumes", "cell_dimension", "contact_state")
+INTEGERS = ("cell_dimension", "contact_state")
 
 
 def write(scene: Scene, path: str | os.PathLike[str], *, compression: str | None = "gzip") -> Path:
@@ -53,9 +63,11 @@ def write(scene: Scene, path: str | os.PathLike[str], *, compression: str | None
     """
     target = Path(path)
     scene.validate()
-    if scene.cells or any(scene.row_range(f) != (0, n) for f, n in scene.sizes.items()):
+    if any(scene.row_range(f) != (0, n) for f, n in scene.sizes.items()):
         raise SceneError(f"{target}: only a whole scene can be written, this is the part of one rank")
-    return _write_file(target, lambda file: write_group(file, scene, dataset_creator(compression)))
+    with complete(target) as temporary, h5py.File(temporary, "w") as file:
+        write_group(file, scene, dataset_creator(compression))
+    return target
 
 
 def dataset_creator(compression: str | None) -> Callable[[h5py.Group, str, Any], object]:
@@ -68,14 +80,8 @@ def dataset_creator(compression: str | None) -> Callable[[h5py.Group, str, Any],
     return create
 
 
-def _write_file(target: Path, fill: Callable[[h5py.File], None]) -> Path:
-    with complete(target) as temporary, h5py.File(temporary, "w") as file:
-        fill(file)
-    return target
-
-
 def write_solution(solution: Mapping[str, Any], path: str | os.PathLike[str], scene: Scene) -> Path:
-    """Write a solution, one dataset per field in the scene's numbering and units.
+    """Write a solution, one dataset per field in the scene's numbering and units; see `write`.
 
     Args:
         solution: all rows of each field.
@@ -85,17 +91,15 @@ def write_solution(solution: Mapping[str, Any], path: str | os.PathLike[str], sc
     Raises:
         UsageError: the file cannot be written.
     """
-
-    def fill(file: h5py.File) -> None:
+    target = Path(path)
+    with complete(target) as temporary, h5py.File(temporary, "w") as file:
         file.attrs["encoding-type"] = "petsc_fs solution"
         file.attrs["encoding-version"] = VERSION
-        file.attrs["model"] = scene.metadata.model
-        file.attrs["time_step_index"] = scene.metadata.time_step_index
-        file.attrs["newton_index"] = scene.metadata.newton_index
+        for name in ("model", "time_step_index", "newton_index"):
+            file.attrs[name] = getattr(scene.metadata, name)
         for name, values in solution.items():
             file.create_dataset(name, data=values).attrs["unit"] = FIELD[name].unit
-
-    return _write_file(Path(path), fill)
+    return target
 
 
 def write_group(file: h5py.Group, scene: Scene, create: Callable[[h5py.Group, str, Any], object]) -> None:
@@ -128,9 +132,14 @@ def write_group(file: h5py.Group, scene: Scene, create: Callable[[h5py.Group, st
         group.attrs["size"] = scene.sizes[name]
         group.attrs["block_size"] = scene.block_size(name)
         group.attrs["unit"] = FIELD[name].unit
-        put(group, "rhs", scene.rhs[name])
-        for what, values in _known_arrays(scene, name).items():
-            put(group, what, values)
+        for what in (*PER_ROW, *PER_CELL):
+            values = getattr(scene, what)
+            if isinstance(values, dict):
+                values = values.get(name)
+            elif name != {"cell_dimension": "mass", "contact_state": "contact"}[what]:
+                continue
+            if values is not None:
+                put(group, what, values)
     file.create_group("blocks")
     for (r, c), block in scene.blocks.items():
         group = file.create_group(f"blocks/{r}/{c}")
@@ -148,25 +157,9 @@ def write_group(file: h5py.Group, scene: Scene, create: Callable[[h5py.Group, st
                 group.attrs[what] = float(np.asarray(value))
 
 
-def _known_arrays(scene: Scene, name: str) -> dict[str, Any]:
-    """The optional arrays of a field that the scene has."""
-    found: dict[str, Any] = {
-        "reference": scene.reference.get(name),
-        "cell_centers": scene.cell_centers.get(name),
-        "cell_volumes": scene.cell_volumes.get(name),
-        "cell_dimension": scene.cell_dimension if name == "mass" else None,
-        "contact_state": scene.contact_state if name == "contact" else None,
-    }
-    return {k: v for k, v in found.items() if v is not None}
-
-
 def versions() -> dict[str, str]:
     """Version of this package and of the file library."""
-    try:
-        own = version("petsc_fs")
-    except PackageNotFoundError:
-        own = "unknown"
-    return {"petsc_fs": own, "h5py": h5py.version.version, "hdf5": h5py.version.hdf5_version}
+    return {"petsc_fs": __version__, "h5py": h5py.version.version, "hdf5": h5py.version.hdf5_version}
 
 
 def read_sizes(path: str | os.PathLike[str]) -> tuple[int, dict[str, int]]:
@@ -192,7 +185,8 @@ def read(
         rows: given dimension and sizes, the half-open range of rows per field to read; all if None.
 
     Raises:
-        SceneError: the file is missing, no HDF5, cut short, not a scene, or of another version.
+        SceneError: the file is missing, locked, no HDF5, cut short, not a scene, of another version, or promises more
+            than it holds.
         LayoutError: its parts do not fit together.
     """
     with open_file(Path(path)) as file:
@@ -204,10 +198,43 @@ def read_group(
 ) -> Scene:
     """Read a scene, or the rows of one rank, from an open file or a group of one; see `read`."""
     dimension, sizes = read_header(group)
-    ranges = {f: (0, n) for f, n in sizes.items()} if rows is None else dict(rows(dimension, sizes))
-    scene = _read(group, dimension, sizes, ranges)
-    if rows is not None:
-        scene.rows = ranges
+    promised = sum(check_storage(group[name]) for name in ("fields", "blocks", "material") if name in group)
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if rows is None and promised > memory:
+        raise SceneError(f"takes {promised / 2**30:.0f} GiB, and this machine has {memory / 2**30:.0f} GiB")
+    chosen = {f: (0, n) for f, n in sizes.items()} if rows is None else rows(dimension, sizes)
+    ranges = {f: (int(a), int(b)) for f, (a, b) in chosen.items()}
+    arrays: dict[str, dict[str, Any]] = {what: {} for what in (*PER_ROW, *PER_CELL)}
+    for f, size in sizes.items():
+        datasets, bs = group["fields"][f], FIELD[f].block_size(dimension)
+        for what, found in arrays.items():
+            unit = bs if what in PER_CELL else 1
+            if what in datasets:
+                shape = (size // unit, 3) if what == "cell_centers" else (size // unit,)
+                part = slice(*(n // unit for n in ranges[f]))
+                found[f] = _read_array(datasets[what], f"{f}: {what}", shape, part, what not in INTEGERS)
+    blocks: dict[tuple[str, str], CSR] = {}
+    for r, row in group["blocks"].items():
+        for c, block in row.items():
+            if r not in sizes or c not in sizes:
+                raise LayoutError(f"block ({r}, {c}): the scene has no field {r if r not in sizes else c!r}")
+            read_rows = partial(_read_block, block, f"block ({r}, {c})", (sizes[r], sizes[c]))
+            if r == c and rows is not None:  # a whole scene is asked for it when it is there
+                check_order(r, dimension, sizes[r], read_rows)
+            blocks[r, c] = read_rows(*ranges[r])
+    scene = Scene(
+        dimension=dimension,
+        sizes=sizes,
+        blocks=blocks,
+        cell_dimension=arrays.pop("cell_dimension").get("mass"),
+        contact_state=arrays.pop("contact_state").get("contact"),
+        **arrays,
+        material=_read_material(group["material"], sizes["mass"], slice(*ranges["mass"]))
+        if "material" in group and "mass" in sizes
+        else None,
+        metadata=read_metadata(group),
+        rows=None if rows is None else ranges,
+    )
     scene.validate()
     return scene
 
@@ -215,18 +242,20 @@ def read_group(
 @contextmanager
 def open_file(path: Path) -> Iterator[h5py.File]:
     """The file, with every way in which it can be unreadable told apart."""
-    if not path.exists():
-        raise SceneError(f"{path}: no such file")
-    if path.is_dir():
-        raise SceneError(f"{path}: is a directory, not a scene")
+    check_regular(path, "scene")
     try:
         _check_heaps(path)
         file = h5py.File(path, "r")
     except OSError as e:
         if isinstance(e, PermissionError):
             raise SceneError(f"{path}: no permission to read it") from e
-        if "truncated" in str(e):
-            raise SceneError(f"{path}: the file is truncated; copy or export it again") from e
+        for sign, meaning in (
+            ("truncated", "the file is truncated; copy or export it again"),
+            ("to lock file", f"locked: another program has it open for writing{LOCKS}"),
+            ("h5clear", f"a program that wrote to it has not closed it; if none does any more, h5clear -s {path.name}"),
+        ):
+            if sign in str(e):
+                raise SceneError(f"{path}: {meaning}") from e
         raise SceneError(f"{path}: not an HDF5 file, so not a scene; make one with petsc-fs export") from e
     with file, explained(path):
         yield file
@@ -268,37 +297,59 @@ def explained(path: Path) -> Iterator[None]:
         raise SceneError(f"{path}: the scene is damaged ({e}); copy or export it again") from e
 
 
-def read_header(file: h5py.File) -> tuple[int, dict[str, int]]:
+def attribute(group: h5py.Group, name: str, kind: type[T]) -> T:
+    """A text or number as any language writes it: of fixed or variable length, of any type, alone or an array of one.
+
+    Raises:
+        KeyError: there is none.
+        SceneError: it is something else.
+    """
+    found = group.attrs[name]
+    value = np.asarray("" if isinstance(found, h5py.Empty) else found).ravel()
+    if value.size == 1:
+        item = value[0].decode(errors="replace") if isinstance(value[0], bytes) else value.tolist()[0]
+        if kind is str and isinstance(item, str):
+            return kind(item.rstrip("\0 ").encode(errors="replace").decode())
+        if kind is not str and isinstance(item, int | float) and (kind is float or float(item).is_integer()):
+            return kind(item)
+    words = {str: "a text", int: "a whole number", float: "a number"}[kind]
+    raise SceneError(f"{name}: expected {words}, found {value.tolist() if value.size != 1 else item!r}")
+
+
+def check_encoding(file: h5py.Group, encoding: str) -> None:
+    """Refuse what is not in a format, or in another version of it."""
+    found = attribute(file, "encoding-type", str) if "encoding-type" in file.attrs else None
+    if found == "petsc_fs sequence" != encoding:
+        raise SceneError("a sequence of scenes, and one is needed; petsc-fs convert --step K takes one out of it")
+    if found != encoding:
+        what = f"its encoding-type is {found!r}" if found is not None else "it has no encoding-type"
+        raise SceneError(f"an HDF5 file, but not a {encoding}: {what}, expected {encoding!r}")
+    number = attribute(file, "encoding-version", int)
+    if number != VERSION:
+        what = f"this petsc_fs reads {VERSION}; update petsc_fs" if number > VERSION else "which is no longer read"
+        raise SceneError(f"written in version {number} of the format, {what}")
+
+
+def read_header(file: h5py.Group) -> tuple[int, dict[str, int]]:
     """Dimension of a scene, and size of each field.
 
     Raises:
         SceneError: the file is not a scene of this version.
         LayoutError: a size is impossible.
     """
-    found, number = file.attrs.get("encoding-type"), file.attrs.get("encoding-version")
-    if found == "petsc_fs sequence":
-        raise SceneError("a sequence of scenes, and one is needed; petsc-fs convert --step K takes one out of it")
-    if found != ENCODING:
-        what = f"its encoding-type is {found!r}" if found is not None else "it has no encoding-type"
-        raise SceneError(f"an HDF5 file, but not a petsc_fs scene: {what}, expected {ENCODING!r}")
-    if not isinstance(number, int | np.integer):
-        raise SceneError(f"encoding-version is {number!r}, expected the number {VERSION}")
-    if number > VERSION:
-        raise SceneError(f"written in version {number} of the format, this petsc_fs reads {VERSION}; update petsc_fs")
-    if number < VERSION:
-        raise SceneError(f"written in version {number} of the format, which is no longer read; export it again")
-    dimension = int(file.attrs["dimension"])
+    check_encoding(file, ENCODING)
+    dimension = attribute(file, "dimension", int)
     if dimension not in (2, 3):
         raise SceneError(f"dimension: expected 2 or 3, found {dimension}")
-    for name in file.attrs["fields"]:
-        if name not in file["fields"]:
-            raise SceneError(f"the scene is incomplete: field {name!r} has no group")
+    for name in np.ravel(file.attrs["fields"]):
+        word = name.decode(errors="replace") if isinstance(name, bytes) else str(name)
+        if word.rstrip("\0 ") not in file["fields"]:
+            raise SceneError(f"the scene is incomplete: field {word!r} has no group")
     sizes: dict[str, int] = {}
-    for name in file["fields"]:
+    for name, group in file["fields"].items():
         if name not in FIELD:
             raise LayoutError(f"unknown field {name!r}; fields are {', '.join(FIELD_NAMES)}")
-        sizes[name] = int(file["fields"][name].attrs["size"])
-        bs = int(file["fields"][name].attrs["block_size"])
+        sizes[name], bs = attribute(group, "size", int), attribute(group, "block_size", int)
         if bs != FIELD[name].block_size(dimension):
             raise LayoutError(
                 f"{name}: block_size is {bs}, expected {FIELD[name].block_size(dimension)} in {dimension}D"
@@ -308,95 +359,111 @@ def read_header(file: h5py.File) -> tuple[int, dict[str, int]]:
     return dimension, {name: sizes[name] for name in in_order(sizes)}
 
 
-def _read(file: h5py.File, dimension: int, sizes: dict[str, int], rows: Mapping[str, tuple[int, int]]) -> Scene:
-    found: dict[str, dict[str, Any]] = {name: {} for name in ("rhs", "reference", *PER_CELL)}
-    for name, size in sizes.items():
-        group = file["fields"][name]
-        bs = FIELD[name].block_size(dimension)
-        for what, store in found.items():
-            if what not in group:
-                continue
-            per_cell = what in PER_CELL
-            expected = size // bs if per_cell else size
-            if group[what].shape[:1] != (expected,):
-                raise LayoutError(f"{name}: {what} has {len(group[what])} entries, expected {expected}")
-            a, b = rows[name]
-            values = group[what][a // bs : b // bs] if per_cell else group[what][a:b]
-            store[name] = values if what in ("cell_dimension", "contact_state") else real_numbers(values)
-    blocks: dict[tuple[str, str], CSR] = {}
-    for r, row in file["blocks"].items():
-        for c in row:
-            what = f"block ({r}, {c})"
-            if r not in sizes or c not in sizes:
-                raise LayoutError(f"{what}: the scene has no field {r if r not in sizes else c!r}")
-            blocks[r, c] = _read_block(row[c], what, (sizes[r], sizes[c]), *rows[r])
-    return Scene(
-        dimension=dimension,
-        sizes=sizes,
-        blocks=blocks,
-        rhs=found["rhs"],
-        reference=found["reference"],
-        cell_centers=found["cell_centers"],
-        cell_volumes=found["cell_volumes"],
-        cell_dimension=found["cell_dimension"].get("mass"),
-        contact_state=found["contact_state"].get("contact"),
-        material=_read_material(file, sizes["mass"], rows["mass"]) if "material" in file and "mass" in sizes else None,
-        metadata=read_metadata(file),
-    )
+def check_storage(group: h5py.Group, depth: int = 3) -> int:
+    """Refuse datasets that promise more than the file holds, before anything is allocated for them.
+
+    HDF5 fills in what is not there without a word: chunks that were never written, virtual datasets whose sources are
+    missing.
+
+    Returns:
+        Size of all datasets, in bytes.
+
+    Raises:
+        SceneError: a dataset lies in another file, is not written in full, or says that it is larger than it can be.
+    """
+    total = 0
+    for name in group:
+        if isinstance(group.get(name, getlink=True), h5py.ExternalLink):
+            raise SceneError(f"{group.name}/{name} lies in another file; a scene is one file: copy it into it")
+        item = group[name]
+        if isinstance(item, h5py.Group) and depth:
+            total += check_storage(item, depth - 1)
+        if not isinstance(item, h5py.Dataset) or not item.shape or 0 in item.shape:
+            continue
+        made, size, stored = item.id.get_create_plist(), item.id.get_type().get_size(), item.id.get_storage_size()
+        if made.get_layout() == h5py.h5d.VIRTUAL or made.get_external_count():
+            raise SceneError(f"{item.name} lies in other files; a scene is one file: h5repack -l CONTI writes one")
+        promised = needed = math.prod(item.shape) * size
+        there = stored
+        if made.get_layout() == h5py.h5d.CHUNKED:
+            chunk = made.get_chunk()
+            needed, there = (
+                math.prod(-(-n // c) for n, c in zip(item.shape, chunk, strict=True)),
+                item.id.get_num_chunks(),
+            )
+            promised = needed * math.prod(chunk) * size
+        if there < needed:
+            raise SceneError(f"{item.name} is not written in full, so that HDF5 would make it up; export it again")
+        if stored > item.file.id.get_filesize() or promised > max(SMALL, DEFLATE * stored):
+            raise SceneError(f"{item.name} says that it has {promised} bytes, and {stored} are there; export it again")
+        total += promised
+    return total
 
 
-def read_metadata(file: h5py.File) -> Metadata:
+def _read_array(dataset: h5py.Dataset, what: str, shape: tuple[int, ...], part: slice, real: bool = True) -> Any:
+    """Part of a dataset of a shape, as double if `real`; also of a column or a row."""
+    if dataset.dtype.kind not in "biuf":
+        raise SceneError(f"the scene is damaged ({what}: expected real numbers)")
+    if dataset.shape == shape:
+        values = dataset[part]
+    elif dataset.shape == (*shape, 1):
+        values = dataset[part, 0]
+    elif dataset.shape == (1, *shape):
+        values = dataset[0, part]
+    else:
+        raise LayoutError(f"{what} has shape {dataset.shape}, expected {shape}")
+    return values.astype(np.float64, copy=False) if real else values
+
+
+def read_metadata(file: h5py.Group) -> Metadata:
     """Where a scene comes from."""
+    units, producers = file["units"], file["producers"]
     return Metadata(
-        model=str(file.attrs["model"]),
-        time_step_index=int(file.attrs["time_step_index"]),
-        newton_index=int(file.attrs["newton_index"]),
-        time=float(file.attrs["time"]),
-        units={k: float(v) for k, v in file["units"].attrs.items()},
-        producers={k: str(v) for k, v in file["producers"].attrs.items()},
+        model=attribute(file, "model", str),
+        time_step_index=attribute(file, "time_step_index", int),
+        newton_index=attribute(file, "newton_index", int),
+        time=attribute(file, "time", float),
+        units={name: attribute(units, name, float) for name in units.attrs},
+        producers={name: attribute(producers, name, str) for name in producers.attrs},
     )
 
 
 def _read_block(group: h5py.Group, what: str, shape: tuple[int, int], start: int, stop: int) -> CSR:
-    check_block(group, what, shape)
+    """Rows start:stop of a block of a shape."""
+    encoding, found = attribute(group, "encoding-type", str), tuple(np.ravel(group.attrs["shape"]).tolist())
+    if encoding != "csr_matrix":
+        raise LayoutError(f"{what}: encoding-type is {encoding!r}, expected 'csr_matrix'")
+    if found != shape:
+        raise LayoutError(f"{what}: shape is {found}, expected {shape}")
     pointers, columns, values = (group[name] for name in CSR._fields)
-    indptr = pointers[start : stop + 1].astype(np.int64)
+    size = int(values.size)
+    if pointers.size != shape[0] + 1:
+        raise LayoutError(f"{what}: indptr has {pointers.size} entries, expected {shape[0] + 1}")
+    if columns.size != size:
+        raise LayoutError(f"{what}: {columns.size} indices but {size} values")
+
+    def integers(dataset: h5py.Dataset, a: int, b: int) -> Integers:
+        found = _read_array(dataset, f"{what}: indptr and indices", (int(dataset.size),), slice(a, b), real=False)
+        return whole_numbers(found, f"{what}: indptr and indices")
+
+    indptr = integers(pointers, start, stop + 1).astype(np.int64)
     a, b = int(indptr[0]), int(indptr[-1])
     if start == 0 and a != 0:
         raise LayoutError(f"{what}: indptr starts at {a}, expected 0")
-    if not 0 <= a <= b <= values.size:
-        raise LayoutError(f"{what}: indptr runs to {b}, but there are {values.size} values")
-    if stop == shape[0] and b != values.size:
-        raise LayoutError(f"{what}: indptr ends at {b}, but there are {values.size} values")
-    return CSR(indptr - a, columns[a:b], real_numbers(values[a:b]))
+    if (np.diff(indptr) < 0).any():
+        raise LayoutError(f"{what}: indptr must start at 0 and not decrease")
+    if not 0 <= a <= b <= size:
+        raise LayoutError(f"{what}: indptr runs to {b}, but there are {size} values")
+    if stop == shape[0] and b != size:
+        raise LayoutError(f"{what}: indptr ends at {b}, but there are {size} values")
+    return CSR(indptr - a, integers(columns, a, b), _read_array(values, f"{what}: data", (size,), slice(a, b)))
 
 
-def check_block(group: h5py.Group, what: str, shape: tuple[int, int]) -> None:
-    """The shapes and kinds of the datasets of a block."""
-    encoding = group.attrs["encoding-type"]
-    if encoding != "csr_matrix":
-        raise LayoutError(f"{what}: encoding-type is {encoding!r}, expected 'csr_matrix'")
-    if tuple(group.attrs["shape"]) != shape:
-        raise LayoutError(f"{what}: shape is {tuple(group.attrs['shape'])}, expected {shape}")
-    pointers, columns, values = (group[name] for name in CSR._fields)
-    if pointers.dtype.kind not in "iu" or columns.dtype.kind not in "iu":
-        raise LayoutError(f"{what}: indptr and indices must be integers")
-    if pointers.shape != (shape[0] + 1,):
-        raise LayoutError(f"{what}: indptr has {pointers.size} entries, expected {shape[0] + 1}")
-    if columns.shape != values.shape:
-        raise LayoutError(f"{what}: {columns.size} indices but {values.size} values")
-
-
-def real_numbers(values: Any) -> Floats:
-    """Numbers as they are computed with; a TypeError for text and complex numbers."""
-    return np.asarray(values).astype(np.float64, casting="same_kind", copy=False)
-
-
-def _read_material(file: h5py.File, size: int, rows: tuple[int, int]) -> Material:
-    group = file["material"]
-    names = [a.name for a in attributes(Material) if a.name != "time_step"]
-    for name in group:
-        if group[name].shape != (size,):
-            raise LayoutError(f"material: {name} has shape {group[name].shape}, expected {(size,)}")
-    values = {n: real_numbers(group[n][slice(*rows)]) if n in group else float(group.attrs[n]) for n in names}
-    return Material(**values, time_step=float(group.attrs["time_step"]))
+def _read_material(group: h5py.Group, size: int, part: slice) -> Material:
+    values: dict[str, Any] = {
+        name: _read_array(group[name], f"material: {name}", (size,), part)
+        if name in group
+        else attribute(group, name, float)
+        for name in (a.name for a in attributes(Material))
+    }
+    return Material(**values)

@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from petsc_fs.errors import SceneError, UsageError
 from petsc_fs.fields import FIELD_NAMES, MECHANICS
-from petsc_fs.fixed_stress import analytic_coefficients
 from petsc_fs.io import hdf5
 from petsc_fs.io.files import check_regular, complete
 from petsc_fs.scene import CSR, Integers, Scene
@@ -87,7 +86,7 @@ def from_scene(source: Path, folder: Path) -> list[Path]:
 
 def companions(scene: Scene, name: str) -> dict[str, NDArray[np.float64]]:
     """Vectors over the rows of a field that PCs look for, by the names they are composed under; see `petsc_fs.nest`."""
-    if name == "mass" and (coefficients := analytic_coefficients(scene)) is not None:
+    if name == "mass" and (coefficients := scene.fixed_stress_coefficients()) is not None:
         return {"fixed_stress_base": coefficients[:, 0], "fixed_stress_ratio": coefficients[:, 1]}
     if name in MECHANICS and name in scene.cell_centers:
         return {"coordinates": scene.cell_centers[name][:, : scene.dimension].ravel()}

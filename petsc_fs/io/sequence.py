@@ -185,9 +185,9 @@ class Writer:
 def is_sequence(path: str | os.PathLike[str]) -> bool:
     """Whether a file is a sequence; False also for what cannot be read at all."""
     try:
-        with h5py.File(path, "r") as file:
-            return bool(file.attrs.get("encoding-type") == ENCODING)
-    except OSError:
+        with hdf5.open_file(Path(path)) as file:
+            return "encoding-type" in file.attrs and hdf5.attribute(file, "encoding-type", str) == ENCODING
+    except SceneError:
         return False
 
 
@@ -199,7 +199,9 @@ def read_contents(path: str | os.PathLike[str]) -> Contents:
     """
     with hdf5.open_file(Path(path)) as file:
         steps = tuple(_step(group, k) for k, group in enumerate(_groups(file)))
-        return Contents(model=str(file.attrs["model"]), complete=bool(file.attrs["complete"]), steps=steps)
+        return Contents(
+            model=hdf5.attribute(file, "model", str), complete=bool(hdf5.attribute(file, "complete", int)), steps=steps
+        )
 
 
 def read(path: str | os.PathLike[str], step: int, rows: Rows | None = None) -> Scene:
@@ -261,13 +263,7 @@ def parse_steps(text: str, count: int) -> range:
 
 
 def _groups(file: h5py.File) -> list[h5py.Group]:
-    found, number = file.attrs.get("encoding-type"), file.attrs.get("encoding-version")
-    if found != ENCODING:
-        raise SceneError(f"not a petsc_fs sequence: its encoding-type is {found!r}, expected {ENCODING!r}")
-    if number != VERSION:
-        raise SceneError(
-            f"a sequence in version {number} of the format, this petsc_fs reads {VERSION}; update petsc_fs"
-        )
+    hdf5.check_encoding(file, ENCODING)
     steps = file["steps"]
     if not len(steps):
         raise SceneError("the sequence has no steps")
@@ -275,14 +271,16 @@ def _groups(file: h5py.File) -> list[h5py.Group]:
 
 
 def _step(group: h5py.Group, index: int) -> Step:
-    states = group["fields/contact"].get("contact_state") if "contact" in group["fields"] else None
+    dimension, sizes = hdf5.read_header(group)
+    meta = hdf5.read_metadata(group)
+    states = group["fields/contact"].get("contact_state") if "contact" in sizes else None
     return Step(
         index=index,
-        time_step_index=int(group.attrs["time_step_index"]),
-        newton_index=int(group.attrs["newton_index"]),
-        time=float(group.attrs["time"]),
-        dimension=int(group.attrs["dimension"]),
-        sizes={name: int(group["fields"][name].attrs["size"]) for name in group.attrs["fields"]},
+        time_step_index=meta.time_step_index,
+        newton_index=meta.newton_index,
+        time=meta.time,
+        dimension=dimension,
+        sizes=sizes,
         entries=sum(block["data"].size for row in group["blocks"].values() for block in row.values()),
         contact_states={} if states is None else contact_state_counts(states[:]),
         run={k: v.item() if isinstance(v, np.generic) else v for k, v in group["run"].attrs.items()},

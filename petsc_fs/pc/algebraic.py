@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from petsc_fs.nest import magnitudes
+
 SHARE = 0.7
 """Of an upper bound. Fixed stress needs more than half of what mechanics adds; in 2D the bound is close to that, in 3D
 some way above it. Iterations in undrained rock hardly change between 0.5 and 1 (2D 22 to 20, 3D 25 to 27)."""
@@ -37,7 +39,7 @@ def stabilisation(A: PETSc.Mat, B: PETSc.Mat, C: PETSc.Mat) -> NDArray[np.float6
     Returns:
         (rows of C on this rank,), not negative; its sign is that of the diagonal of the mass balance.
     """
-    B, C = _magnitudes(B), _magnitudes(C)
+    B, C = magnitudes(B), magnitudes(C)
     weights, inverse = B.createVecs()
     A.getDiagonal(inverse)
     inverse.abs()
@@ -62,13 +64,3 @@ def stabilisation(A: PETSc.Mat, B: PETSc.Mat, C: PETSc.Mat) -> NDArray[np.float6
     for temporary in (B, C, weights, inverse, moved, norms, plain, weighted):
         temporary.destroy()
     return result
-
-
-def _magnitudes(M: PETSc.Mat) -> PETSc.Mat:
-    """A copy with the magnitudes of all entries. Collective."""
-    if M.getType() == "nest":
-        rows, columns = (range(n) for n in M.getNestSize())
-        blocks = [[M.getNestSubMatrix(i, j) for j in columns] for i in rows]
-        return PETSc.Mat().createNest([[_magnitudes(b) if b else None for b in row] for row in blocks], comm=M.comm)
-    indptr, indices, values = M.getValuesCSR()
-    return PETSc.Mat().createAIJ(M.getSizes(), csr=(indptr, indices, np.abs(values, out=values)), comm=M.comm)

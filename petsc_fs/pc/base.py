@@ -71,7 +71,7 @@ class BasePC(ABC):
     inners: tuple[PETSc.PC, ...] = ()
 
     def create(self, pc: PETSc.PC) -> None:
-        """Note that there is such a PC. Local."""
+        """Note that the PC is there: it may never be set up, where another one fails. Local."""
         _alive[pc.handle] = None
 
     @told

@@ -194,11 +194,13 @@ def grouped(names: tuple[str, ...], S: Blocks, mechanics: tuple[str, ...], mat_t
 
     count = range(len(groups))
     grid = [[block(i, j) for j in count] for i in count]
-    grid[first][first].setName("mechanics" if len(mechanics) > 1 else mechanics[0])
+    merged: Any = grid[first][first]
+    merged.setName("mechanics" if len(mechanics) > 1 else mechanics[0])
     whole = PETSc.Mat().createNest(grid, comm=comm)
     for i, j in product(count, count):
-        if grid[i][j] and len(groups[i]) + len(groups[j]) > 2:
-            grid[i][j].destroy()  # the nest holds it
+        part = grid[i][j]
+        if part is not None and len(groups[i]) + len(groups[j]) > 2:
+            part.destroy()  # the nest holds it
     return whole
 
 

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import petsc_fs
-from petsc_fs.cutting import Cutter
 from petsc_fs.errors import LayoutError, SceneError
 from petsc_fs.fields import FIELD, in_order
 from petsc_fs.porepy import require_porepy
@@ -71,7 +70,6 @@ class Adapter:
             raise SceneError("the model has no equation system yet: call model.prepare_simulation() first")
         self.model = model
         self._structure: Any = None
-        self._cutter = Cutter()
         self._refresh()
 
     @property
@@ -131,7 +129,6 @@ class Adapter:
             rhs,
             self._rows,
             columns=self._columns,
-            cutter=self._cutter,
             dimension=model.nd,
             cell_centers={f: np.concatenate([g.cell_centers.T for g in gs]) for f, gs in cells.items()},
             cell_volumes={f: np.concatenate([g.cell_volumes for g in gs]) for f, gs in cells.items()},

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petsc_fs import options
-from petsc_fs.cli import main as cli
 from petsc_fs.errors import PetscFsError, SolveError, UsageError, together
+from petsc_fs.io.bundled import versions
 from petsc_fs.io.files import write_text
 from petsc_fs.porepy import require_porepy
 from petsc_fs.porepy.cases import CASES, ModelParameters
@@ -94,11 +94,13 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
             if parameters.changes():
                 raise UsageError(f"{args.model}: {parameters.changes()}: only the models of this package take these")
         folder = args.out or Path(f"{args.model if is_case else args.model.rpartition(':')[2]}_run")
-        petsc, file = _without_options_file(petsc)
+        given = options.Given.of(petsc)
+        if len(given.files) > 1:
+            raise UsageError("-options_file: a run takes one")
         if comm.rank == 0:
             require_porepy()
             _make_folder(folder)
-    given = cli.GivenOptions.start_petsc(petsc, file)
+    given.start(files=False)
     outcome = None
     error: BaseException | None = None
     with _terminate_as_interrupt(comm.rank):
@@ -112,10 +114,7 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
                 if client is not None:
                     client.stop()
         _raise_together(error, comm)
-    if outcome is not None:
-        from petsc_fs.cli.tables import run_table
-
-        print(run_table(outcome), flush=True)
+    args.summary = outcome
     return 0
 
 
@@ -166,7 +165,7 @@ class _Run:
     """One run on rank 0, and what it leaves in its folder."""
 
     def __init__(
-        self, args: argparse.Namespace, parameters: ModelParameters, folder: Path, given: cli.GivenOptions, ranks: int
+        self, args: argparse.Namespace, parameters: ModelParameters, folder: Path, given: options.Given, ranks: int
     ) -> None:
         from petsc_fs.porepy.display import display_for
 
@@ -217,8 +216,8 @@ class _Run:
         self.model, runner = _prepare_model(self.args.model, self.parameters, self.folder, self.args.vtu)
         self.name = getattr(self.model, "scene_name", type(self.model).__name__)
         self.model.observer = self.observer
-        if self.given.file is not None:
-            self.model.params["petsc_fs_options_file"] = str(self.given.file)
+        if self.given.files:
+            self.model.params["petsc_fs_options_file"] = str(self.given.files[0])
         if self.args.sequence:
             from petsc_fs.io import sequence
 
@@ -234,7 +233,11 @@ class _Run:
             scene = scene_from_model(model)
         update = solve()
         if not self.observer.records:
-            self.given.refuse_unused()
+            from mpi4py import MPI
+
+            warning = self.given.judge(MPI.COMM_SELF)
+            if warning:
+                print(f"petsc-fs: warning: {warning}", file=sys.stderr)
         if self.writer is not None and scene is not None:
             with self.observer.phase("output"):
                 self.writer.append(scene, run_attributes(model))
@@ -305,9 +308,9 @@ class _Run:
             "folder": str(self.folder),
             "files": [*self.files, SUMMARY],
             "notes": self.notes,
-            "options_file": None if self.given.file is None else self.given.file.name,
-            "options": cli.database(),
-            "versions": {**cli.versions(), "porepy": str(porepy.__version__)},
+            "options_file": self.given.files[0].name if self.given.files else None,
+            "options": options.database(),
+            "versions": {**versions(), "porepy": str(porepy.__version__)},
         }
 
 
@@ -413,29 +416,6 @@ def _expected_time_steps(model: Any, limit: int | None) -> int:
     manager = model.time_manager
     whole = max(round(float(manager.schedule[-1] - manager.schedule[0]) / float(manager.dt)), 1)
     return whole if limit is None else min(whole, limit)
-
-
-def _without_options_file(petsc: list[str]) -> tuple[list[str], Path | None]:
-    """PETSc's arguments without the options file, which goes to the model instead.
-
-    Raises:
-        UsageError: the file cannot be read, or there are two.
-    """
-    rest: list[str] = []
-    file: Path | None = None
-    words = iter(petsc)
-    for word in words:
-        if word != "-options_file":
-            rest.append(word)
-            continue
-        if file is not None:
-            raise UsageError("-options_file: a run takes one")
-        name = next(words, None)
-        if name is None:
-            raise UsageError("-options_file: the name of the file is missing")
-        file = options.find_options_file(name)
-        options.parse(file)
-    return rest, file
 
 
 def _make_folder(folder: Path) -> None:

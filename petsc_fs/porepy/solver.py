@@ -16,7 +16,6 @@ import logging
 import math
 import sys
 import time
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,9 +27,9 @@ from petsc_fs import options, server
 from petsc_fs.errors import SceneError, SolveError, UsageError
 from petsc_fs.fields import in_order
 from petsc_fs.memory import return_freed
+from petsc_fs.options import Choice, Facts
 from petsc_fs.porepy.forcing import EisenstatWalker, EisenstatWalkerParameters
 from petsc_fs.scene import Scene, contact_state_counts
-from petsc_fs.tree import Facts, Tree, shipped_tree
 
 if TYPE_CHECKING:
     from petsc_fs.porepy.adapter import Adapter
@@ -106,21 +105,6 @@ class LinearSolve:
 
 
 @dataclass
-class _Chosen:
-    """Options of a model, and where they come from.
-
-    Attributes:
-        values: by name without the model's prefix.
-        file: the options file, if one is named.
-        tree: else the smallest solver for the model.
-    """
-
-    values: Mapping[str, str | None]
-    file: Path | None = None
-    tree: Tree | None = None
-
-
-@dataclass
 class _Outcome:
     """A solve and what became of it."""
 
@@ -178,7 +162,7 @@ class FieldSplitSolver:
         self.linear_solves = []
         self._adapter: Adapter | None = None
         self._solver: ServedSolver | None = None
-        self._chosen: _Chosen | None = None
+        self._chosen: Choice | None = None
         self._facts: Facts | None = None
         self._forcing: EisenstatWalker | None = None
         self._newton_tolerance: float | None = None
@@ -251,26 +235,25 @@ class FieldSplitSolver:
     def _options_prefix(self) -> str:
         return str(self.params.get("petsc_fs_options_prefix", ""))
 
-    def _choose(self, scene: Scene) -> _Chosen:
+    def _choose(self, scene: Scene) -> Choice:
         """The options of the file, or of the smallest tree for what the model has shown so far."""
         name = self.params.get("petsc_fs_options_file")
         if name is not None:
             if self._chosen is None:
                 file = _fitting_file(str(name), scene)
-                self._chosen = _Chosen(options.parse(file), file=file)
+                self._chosen = Choice(options.parse(file), file, ())
             return self._chosen
         from petsc4py import PETSc
 
-        facts = Facts.of(scene, PETSc.COMM_SELF.tompi4py()).for_all_contact_states()
+        facts = Facts.of(scene, PETSc.COMM_SELF.tompi4py())
         if self._facts is not None:
             facts = facts.or_either(self._facts)
         if self._chosen is None or facts != self._facts:
             self._forget_solver()
-            tree = shipped_tree(facts)
-            self._chosen, self._facts = _Chosen(tree.options, tree=tree), facts
+            self._chosen, self._facts = options.choose(facts), facts
         return self._chosen
 
-    def _refuse_unused(self, chosen: _Chosen) -> None:
+    def _refuse_unused(self, chosen: Choice) -> None:
         """Raise a UsageError if an option did nothing."""
         retries = self._option("petsc_fs_on_failure", ON_FAILURE) == "retry"
         later = f"{self._options_prefix}{RETRY}"
@@ -278,8 +261,7 @@ class FieldSplitSolver:
         if not useless:
             return
         typed = {word[1:] for word in sys.argv if word.startswith("-")}
-        left_out = chosen.tree.left_out if chosen.tree is not None else ()
-        raise UsageError(options.explain(sorted(useless), typed, chosen.file, left_out))
+        raise UsageError(options.explain(sorted(useless), typed, chosen.file, chosen.left_out))
 
     def _option(self, name: str, choices: tuple[str, ...]) -> str:
         from petsc4py import PETSc

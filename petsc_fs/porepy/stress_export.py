@@ -21,8 +21,7 @@ from petsc_fs.io import hdf5
 from petsc_fs.io.files import complete
 from petsc_fs.porepy.cases import CASES, SIDE, ModelParameters, Rock
 from petsc_fs.scene import Scene, contact_state_counts
-from petsc_fs.tools.stress_cases import RECIPES, Recipe
-from petsc_fs.tools.stress_held_out import HELD_OUT
+from petsc_fs.tools.stress_cases import HELD_OUT, RECIPES, Recipe
 
 Progress = Callable[[str], None]
 SEED = 7

@@ -1,4 +1,4 @@
-"""Compare options files: error against seconds, on any scenes, with any tolerances and numbers of ranks.
+"""Compare options files: error against seconds, or seconds against those of a base file, on any scenes and ranks.
 
 Each combination of scene, options file and number of ranks is measured in processes of its own, all of them once
 before any is measured again and each time in another order, so that noise falls on all alike. The reference solution
@@ -10,16 +10,14 @@ from __future__ import annotations
 import argparse
 import csv
 import io
+import itertools
 import json
 import os
-import platform
 import re
 import signal
-import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,9 +25,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from petsc_fs import options
-from petsc_fs.errors import SolveError, UsageError
+from petsc_fs.errors import UsageError
 from petsc_fs.io.files import write_text
-from petsc_fs.tools.measure import Job, Record, environment, measure
+from petsc_fs.tools.measure import (
+    CLOCKS,
+    Job,
+    Record,
+    Variant,
+    describe_machine,
+    grown,
+    measure_all,
+    seconds_of,
+    split_ranks,
+)
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -37,126 +45,61 @@ if TYPE_CHECKING:
 RTOLS = "1e-2..1e-12"
 TARGETS = tuple(10.0**-k for k in range(1, 13))
 """Accuracies for which the summary names the fastest file."""
-
 ENDED = ("converged", "stagnated")
 """Kinds of records whose solution is one to be judged by its error."""
-
-CLOCKS = {"wall": "wall clock", "cpu": "processor time"}
-"""What seconds can be, and what axes call them. Processor time, the busiest rank's, is steadier where other programs
-run, but hides what waits for others."""
-
-PARDISO = "mkl_pardiso"
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One thing to compare: an options file, perhaps with further options.
-
-    Attributes:
-        label: what pictures call it.
-        path: of the file.
-        options: without the dash, which win over the file.
-        fields: that a scene must have; empty if any will do.
-        not_for: models it is known to fail on.
-        purpose: first line of the file.
-        text: the file, verbatim.
-    """
-
-    label: str
-    path: str
-    options: dict[str, str | None]
-    fields: tuple[str, ...]
-    not_for: tuple[str, ...]
-    purpose: str
-    text: str
-
-    @classmethod
-    def of(cls, path: Path, more: Mapping[str, str | None] | None = None, suffix: str = "") -> Entry:
-        """Read the header of a file.
-
-        Raises:
-            UsageError: PETSc would not understand the file.
-        """
-        options.parse(path)
-        header = options.read_header(path)
-        return cls(
-            label=path.stem + suffix,
-            path=str(path),
-            options=dict(more or {}),
-            fields=header.fields,
-            not_for=header.not_for,
-            purpose=header.purpose,
-            text=path.read_text(encoding="utf-8"),
-        )
-
-    def applies(self, case: Case) -> bool:
-        """Whether the file is for a scene, by its header."""
-        known = {case.label, *re.findall(r"\w+", case.model)[:1]}
-        return (not self.fields or set(self.fields) == set(case.sizes)) and not known & set(self.not_for)
+SECONDS = {"total": "set-up and solve", "solve": "solve alone"}
+"""The two ways to count: for a system that is solved once, and for one that is set up already."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """A scene to compare on.
+    """A scene or sequence to compare on."""
 
-    Attributes:
-        label: what pictures call it: the name of the file.
-        path: of the file.
-        dimension: of the rock matrix.
-        sizes: unknowns of each field.
-        model: where the scene comes from.
-        reference: what is known of the accuracy of the reference, see `petsc_fs.tools.reference.Reference.about`.
-    """
-
-    label: str
+    label: str  # the name of the file
     path: str
     dimension: int
-    sizes: dict[str, int]
-    model: str
-    reference: dict[str, Any] = field(default_factory=dict)
+    sizes: dict[str, int]  # unknowns of each field, in the first step of a sequence
+    model: str  # where it comes from
+    steps: int = 0  # of a sequence
+    reference: dict[str, Any] = field(default_factory=dict)  # see `petsc_fs.tools.reference.Reference.about`
+
+    @classmethod
+    def of(cls, path: Path) -> Case:
+        """Read the head of a file.
+
+        Raises:
+            SceneError: it is no scene.
+        """
+        from petsc_fs.io import hdf5, sequence
+
+        if sequence.is_sequence(path):
+            contents = sequence.read_contents(path)
+            first = contents.steps[0]
+            return cls(path.stem, str(path), first.dimension, first.sizes, contents.model, len(contents.steps))
+        dimension, sizes = hdf5.read_sizes(path)
+        with hdf5.open_file(path) as file:
+            model = str(file.attrs["model"])
+        return cls(path.stem, str(path), dimension, {f: n for f, n in sizes.items() if n}, model)
 
     @property
-    def unknowns(self) -> int:
-        """Number of unknowns."""
-        return sum(self.sizes.values())
+    def names(self) -> tuple[str, ...]:
+        """By which headers of options files know it."""
+        return (self.label, *re.findall(r"\w+", self.model)[:1])
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """All that was measured, and what with.
-
-    Attributes:
-        cases: scenes.
-        entries: options files.
-        ranks: numbers of ranks.
-        rtols: tolerances, from the loosest.
-        repeat: rounds.
-        records: see `petsc_fs.tools.measure`, with `scene` and `file` as labels, and `ranks` and `round`.
-        given_up: combinations that were not measured again after they had reached the time limit.
-        about: machine, versions and date.
-        clock: what seconds are, one of `CLOCKS`.
-    """
+    """All that was measured, and what with."""
 
     cases: tuple[Case, ...]
-    entries: tuple[Entry, ...]
+    variants: tuple[Variant, ...]
     ranks: tuple[int, ...]
-    rtols: tuple[float, ...]
-    repeat: int
-    records: list[Record]
-    given_up: list[dict[str, Any]]
-    about: dict[str, Any]
-    clock: str = "wall"
-
-    @property
-    def command(self) -> str:
-        """The command line that measures the same, but for folders."""
-        files = dict.fromkeys(Path(entry.path).name for entry in self.entries)
-        words = ["petsc-fs compare", *(Path(case.path).name for case in self.cases), "--options", *files]
-        words += ["--rtol", rtol_words(self.rtols), "--ranks", *map(str, self.ranks)]
-        words += ["--repeat", str(self.repeat), "--clock", self.clock]
-        common = [set(entry.options.items()) for entry in self.entries]
-        more = sorted(set.intersection(*common)) if common else []
-        return " ".join([*words, *(f"-{name} {value or ''}".rstrip() for name, value in more)])
+    rtols: tuple[float, ...]  # from the loosest; empty for those of the files
+    repeat: int  # rounds
+    records: list[Record]  # see `petsc_fs.tools.measure`
+    about: dict[str, Any]  # command, machine and date
+    clock: str = "wall"  # what seconds are, one of `petsc_fs.tools.measure.CLOCKS`
+    base: str = ""  # label of the variant that others are compared to; "" for none
 
     def to_json(self) -> str:
         """Everything, for `from_json`."""
@@ -166,18 +109,11 @@ class Comparison:
     def from_json(cls, text: str) -> Comparison:
         """Read what `to_json` wrote."""
         data = json.loads(text)
-        for case in data["cases"]:
-            case["reference"] = dict(case["reference"])
-        return cls(
-            cases=tuple(Case(**case) for case in data.pop("cases")),
-            entries=tuple(
-                Entry(**(e | {"fields": tuple(e["fields"]), "not_for": tuple(e["not_for"])}))
-                for e in data.pop("entries")
-            ),
-            ranks=tuple(data.pop("ranks")),
-            rtols=tuple(data.pop("rtols")),
-            **data,
-        )
+        cases = tuple(Case(**case) for case in data.pop("cases"))
+        lists = ("fields", "not_for")
+        variants = tuple(Variant(**(v | {k: tuple(v[k]) for k in lists})) for v in data.pop("variants"))
+        ranks, rtols = tuple(data.pop("ranks")), tuple(data.pop("rtols"))
+        return cls(cases=cases, variants=variants, ranks=ranks, rtols=rtols, **data)
 
 
 @dataclass(frozen=True)
@@ -194,177 +130,157 @@ class Spread:
         low, median, high = np.percentile(values, [25, 50, 75])
         return cls(float(median), float(low), float(high))
 
+    def __str__(self) -> str:
+        return f"{self.median:.3g} [{self.low:.3g}, {self.high:.3g}]"
+
 
 @dataclass(frozen=True)
 class Point:
-    """What one file did with one tolerance on one scene and number of ranks, over all rounds.
-
-    Attributes:
-        scene, file, ranks, rtol: what was measured.
-        ended: whether every round came to a solution.
-        converged: whether every round met the tolerance.
-        iterations: median.
-        error: forward error, median.
-        residual: true residual, median.
-        read, setup, solve: seconds.
-        total: seconds of set-up and solve.
-        direct: whether the file is a factorisation of the whole matrix.
-    """
+    """What one file did with one tolerance on one scene and number of ranks, over all rounds: medians."""
 
     scene: str
     file: str
     ranks: int
-    rtol: float
-    ended: bool
-    converged: bool
+    rtol: float | None
+    ended: bool  # whether every round came to a solution
+    converged: bool  # whether every round met the tolerance
     iterations: float
-    error: float
-    residual: float
-    read: Spread
-    setup: Spread
-    solve: Spread
-    total: Spread
-    direct: bool
+    error: float  # forward error; NaN where there is no reference
+    residual: float  # true residual
+    seconds: dict[str, Spread]  # of "read", "setup", "solve", and "total" of the last two
+    ratios: dict[str, Spread]  # of "setup", "solve" and "total" to those of the base file in the same round
+    memory: float  # bytes that all ranks' memory grew by
 
 
-def seconds_of(record: Record, clock: str) -> dict[str, float]:
-    """Seconds of each phase, "read", "setup" and "solve"."""
-    if clock == "cpu":
-        return dict(record["cpu_by_phase"])
-    return {phase: record[f"{phase}_seconds"] for phase in ("read", "setup", "solve")}
-
-
-def points(records: Sequence[Record], clock: str = "wall") -> list[Point]:
+def points(found: Comparison) -> list[Point]:
     """Medians and quartiles over rounds of all that came to a solution in any of them."""
-    groups: dict[tuple[str, str, int, float], list[Record]] = {}
-    for record in records:
-        if record["rtol"] is not None:
-            key = (record["scene"], record["file"], record["ranks"], record["rtol"])
-            groups.setdefault(key, []).append(record)
-    found = []
-    for (scene, file, ranks, rtol), runs in groups.items():
-        good = [r for r in runs if r["kind"] in ENDED and r["forward_error"] is not None]
+    labels = {case.path: case.label for case in found.cases}
+    groups: dict[tuple[Any, ...], dict[int, Record]] = {}
+    for r in found.records:
+        groups.setdefault((r["scene"], r["ranks"], r["rtol"], r["variant"]), {})[r["round"]] = r
+    rows = []
+    for (scene, ranks, rtol, file), runs in groups.items():
+        good = {k: r for k, r in runs.items() if r["kind"] in ENDED}
         if not good:
             continue
-        seconds = [seconds_of(r, clock) for r in good]
-        found.append(
+        base = groups.get((scene, ranks, rtol, found.base), {})
+        mine = {k: seconds_of(r, found.clock) for k, r in good.items()}
+        theirs = {k: seconds_of(base[k], found.clock) for k in mine if k in base and base[k]["kind"] in ENDED}
+        errors = [r["forward_error"] for r in good.values() if r["forward_error"] is not None]
+        rows.append(
             Point(
-                scene=scene,
+                scene=labels[scene],
                 file=file,
                 ranks=ranks,
                 rtol=rtol,
                 ended=len(good) == len(runs),
-                converged=all(r["kind"] == "converged" for r in runs),
-                iterations=float(np.median([r["iterations"] for r in good])),
-                error=float(np.median([r["forward_error"] for r in good])),
-                residual=float(np.median([r["true_residual"] for r in good])),
-                **{phase: Spread.of([s[phase] for s in seconds]) for phase in ("read", "setup", "solve")},
-                total=Spread.of([s["setup"] + s["solve"] for s in seconds]),
-                direct=bool(good[0]["direct"]),
+                converged=all(r["kind"] == "converged" for r in runs.values()),
+                iterations=float(np.median([r["iterations"] for r in good.values()])),
+                error=float(np.median(errors)) if errors else float("nan"),
+                residual=float(np.median([r["true_residual"] for r in good.values()])),
+                seconds={what: Spread.of([s[what] for s in mine.values()]) for what in ("read", "setup", *SECONDS)},
+                ratios={
+                    what: Spread.of([mine[k][what] / s[what] for k, s in theirs.items()])
+                    for what in ("setup", *SECONDS)
+                    if theirs
+                },
+                memory=float(np.median([grown(r) for r in good.values()])),
             )
         )
-    return found
+    return rows
 
 
 @dataclass(frozen=True)
 class Fastest:
-    """The fastest file for an accuracy.
-
-    Attributes:
-        file: its label.
-        seconds: median of its fastest point whose error is not above the accuracy.
-        ties: other files whose quartiles overlap with its own, from the fastest.
-    """
+    """The fastest file for an accuracy."""
 
     file: str
-    seconds: float
-    ties: tuple[str, ...]
+    seconds: float  # median of its fastest point whose error is not above the accuracy
+    ties: tuple[str, ...]  # other files whose quartiles overlap with its own, from the fastest
+
+    def __str__(self) -> str:
+        ties = f" (≈ {', '.join(self.ties)})" if self.ties else ""
+        return f"{self.file} {self.seconds:.2g} s{ties}"
 
 
-def fastest(found: Sequence[Point], accuracy: float, seconds: Callable[[Point], Spread]) -> Fastest | None:
+def fastest(found: Iterable[Point], accuracy: float, what: str) -> Fastest | None:
     """The fastest file whose forward error is at most `accuracy`, or None if no file gets there.
 
     Args:
         found: points of one scene and number of ranks; those that did not end in every round do not count.
         accuracy: forward error.
-        seconds: what counts, for example `lambda p: p.total`.
+        what: of `SECONDS`, what counts.
     """
     best: dict[str, Spread] = {}
     for point in found:
         if point.ended and point.error <= accuracy:
-            spread = seconds(point)
+            spread = point.seconds[what]
             if point.file not in best or spread.median < best[point.file].median:
                 best[point.file] = spread
-    order = sorted(best.items(), key=lambda item: item[1].median)
-    if not order:
+    if not best:
         return None
-    (file, first), *others = order
+    (file, first), *others = sorted(best.items(), key=lambda item: item[1].median)
     return Fastest(file, first.median, tuple(label for label, spread in others if spread.low <= first.high))
 
 
-SECONDS: dict[str, Callable[[Point], Spread]] = {
-    "set-up and solve": lambda point: point.total,
-    "solve alone": lambda point: point.solve,
-}
-"""The two ways to count: for a system that is solved once, and for one that is set up already."""
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Which files are fastest for a range of accuracies, on one scene and number of ranks.
-
-    Attributes:
-        scene, ranks: where.
-        accuracies: largest and smallest forward error.
-        winners: for each of `SECONDS` the fastest file at each accuracy, the same file throughout; None if none
-            is so accurate.
-    """
-
-    scene: str
-    ranks: int
-    accuracies: tuple[float, float]
-    winners: dict[str, list[Fastest] | None]
-
-    @property
-    def label(self) -> str:
-        """For example "1e-02 … 1e-04"."""
-        return " … ".join(f"{a:.0e}" for a in dict.fromkeys(self.accuracies))
-
-
-def verdicts(found: Comparison) -> list[Verdict]:
-    """Which file is fastest for which accuracy; accuracies of the same winners and ties are one verdict."""
-    everything = points(found.records, found.clock)
-    rows: list[Verdict] = []
-    for case in found.cases:
-        for ranks in found.ranks:
-            mine = [p for p in everything if (p.scene, p.ranks) == (case.label, ranks)]
-            last: Any = None
-            for accuracy in decades(mine):
-                best = {what: fastest(mine, accuracy, seconds) for what, seconds in SECONDS.items()}
-                key = [b and (b.file, b.ties) for b in best.values()]
-                if key == last:
-                    row = rows.pop()
-                    winners = {w: None if b is None else [*(row.winners[w] or []), b] for w, b in best.items()}
-                    rows.append(Verdict(case.label, ranks, (row.accuracies[0], accuracy), winners))
-                else:
-                    first = {w: None if b is None else [b] for w, b in best.items()}
-                    rows.append(Verdict(case.label, ranks, (accuracy, accuracy), first))
-                last = key
+def summary(found: Comparison, everything: Sequence[Point]) -> list[list[object]]:
+    """Scene, ranks, accuracies and the fastest file by each of `SECONDS`; a row for accuracies of the same winners."""
+    rows: list[list[object]] = []
+    for case, ranks in itertools.product(found.cases, found.ranks):
+        mine = [p for p in everything if (p.scene, p.ranks) == (case.label, ranks)]
+        errors = [p.error for p in mine if p.ended and p.error > 0]
+        decades = [t for t in TARGETS if errors and min(errors) <= t <= 10 * max(errors)]
+        winners = [(t, [fastest(mine, t, what) for what in SECONDS]) for t in decades]
+        for _, group in itertools.groupby(winners, key=lambda w: [b and (b.file, b.ties) for b in w[1]]):
+            same = list(group)
+            span = " … ".join(f"{t:.0e}" for t in dict.fromkeys((same[0][0], same[-1][0])))
+            rows.append([case.label, ranks, span, *(str(b or "none") for b in same[-1][1])])
     return rows
 
 
-def seconds_words(winners: Sequence[Fastest]) -> str:
-    """For example "0.12 s", or "0.12–0.2 s" from the loosest accuracy to the strictest."""
-    numbers = dict.fromkeys(f"{w.seconds:.2g}" for w in (winners[0], winners[-1]))
-    return "–".join(numbers) + " s"
+SUMMARY = ("scene", "ranks", "error ≤", *SECONDS.values())
+MEDIANS = "file,ranks,tolerance,iterations,true residual,forward error,set-up (s),solve (s),".split(",")
+RATIOS = (
+    "scene",
+    "ranks",
+    "file",
+    "iterations",
+    "set-up, s",
+    "solve, s",
+    "set-up ratio",
+    "solve ratio",
+    "ratio",
+    "MiB",
+)
 
 
-def decades(found: Sequence[Point]) -> list[float]:
-    """Accuracies worth a row: those between the largest and the smallest error of any point."""
-    errors = [p.error for p in found if p.ended and p.error > 0]
-    if not errors:
-        return []
-    return [t for t in TARGETS if t >= min(errors) and t <= 10 * max(errors)]
+def ratio_rows(found: Comparison, everything: Sequence[Point]) -> list[list[object]]:
+    """Seconds of each file and their ratios to the base file's, and geometric means over scenes at the end."""
+    rows: list[list[object]] = []
+    means: dict[tuple[int, str], list[float]] = {}
+    for p in everything:
+        ratios = ["–"] * 3
+        if p.ratios:
+            means.setdefault((p.ranks, p.file), []).append(p.ratios["total"].median)
+            ratios = [f"{p.ratios[w].median:.2f}" for w in ("setup", "solve")] + [str(p.ratios["total"])]
+        scene = p.scene if p.rtol is None else f"{p.scene} to {p.rtol:.0e}"
+        file = p.file if p.converged else f"{p.file} (not converged)"
+        seconds = [f"{p.seconds[w].median:.3g}" for w in ("setup", "solve")]
+        rows.append([scene, p.ranks, file, f"{p.iterations:g}", *seconds, *ratios, f"{p.memory / 2**20:.3g}"])
+    for (ranks, file), values in sorted(means.items()):
+        if file != found.base:
+            mean = f"{np.exp(np.mean(np.log(values))):.2f}, worst {max(values):.2f}"
+            rows.append(["geometric mean", ranks, file, *[""] * 5, mean, ""])
+    return rows
+
+
+def failures(found: Comparison) -> list[list[object]]:
+    """Scene, file, ranks, outcome, number of runs, and what was said, of all that did not converge."""
+    groups: dict[tuple[str, str, int, str], list[Record]] = {}
+    for r in found.records:
+        if r["kind"] != "converged":
+            groups.setdefault((Path(r["scene"]).stem, r["variant"], r["ranks"], r["kind"]), []).append(r)
+    return [[*key, len(runs), (runs[0]["message"] or runs[0]["reason"] or "")[:300]] for key, runs in groups.items()]
 
 
 def rtols_of(text: str) -> tuple[float, ...]:
@@ -382,215 +298,145 @@ def rtols_of(text: str) -> tuple[float, ...]:
             found = [float(f"{max(first, last) * 10.0 ** (-step * k):.6g}") for k in range(count + 1)]
         else:
             found = [float(word) for word in text.split(",")]
-    except (ValueError, ZeroDivisionError) as e:
+    except (ValueError, ZeroDivisionError, OverflowError) as e:
         raise UsageError(f"--rtol {text}: expected for example 1e-2..1e-12, 1e-2..1e-12:2 or 1e-3,1e-6") from e
     if not found or not all(0 < r < 1 for r in found):
         raise UsageError(f"--rtol {text}: tolerances must lie between 0 and 1")
     return tuple(sorted(set(found), reverse=True))
 
 
-def rtol_words(rtols: Sequence[float]) -> str:
-    """The shortest text that `rtols_of` turns into these tolerances."""
-    for step in ("", ":2", ":3"):
-        text = f"{rtols[0]:.0e}..{rtols[-1]:.0e}{step}"
-        if rtols_of(text) == tuple(rtols):
-            return text
-    return ",".join(f"{r:g}" for r in rtols)
-
-
-def find_cases(names: Sequence[str]) -> list[Case]:
-    """Scenes by path or name of a bundled one.
-
-    Raises:
-        SceneError: one is missing or no scene.
-        UsageError: two have the same name.
-    """
-    from petsc_fs.cli.main import find_scene
-    from petsc_fs.io import hdf5
-
-    cases = []
-    for path in dict.fromkeys(find_scene(name) for name in names):
-        dimension, sizes = hdf5.read_sizes(path)
-        with hdf5.open_file(path) as file:
-            model = str(file.attrs["model"])
-        cases.append(Case(path.stem, str(path), dimension, {f: n for f, n in sizes.items() if n}, model))
-    labels = [case.label for case in cases]
-    for label in labels:
-        if labels.count(label) > 1:
-            raise UsageError(f"two scenes are called {label}: rename one, as pictures tell them apart by name")
-    return cases
-
-
-def find_entries(names: Sequence[str] | None, cases: Sequence[Case], more: Mapping[str, str | None]) -> list[Entry]:
-    """Options files by path or name of a shipped one; by default all shipped ones that are for any of the scenes.
-
-    Where there is a direct solver among them and PETSc has MKL Pardiso, the same with it.
-
-    Raises:
-        UsageError: a file is missing or wrong, or two have the same name, or one is for none of the scenes.
-    """
-    from petsc4py import PETSc
-
-    paths = [options.find_options_file(n) for n in names] if names else [file.path for file in options.shipped()]
-    entries = [Entry.of(path, more) for path in dict.fromkeys(paths)]
-    entries = [e for e in entries if names or any(e.applies(case) for case in cases)]
-    if PETSc.Sys.hasExternalPackage(PARDISO):
-        for entry in list(entries):
-            if options.parse(Path(entry.path)).get("pc_factor_mat_solver_type") == "mumps":
-                pardiso = {**more, "pc_factor_mat_solver_type": PARDISO, options.ALLOW_UNUSED: "mat_mumps_*"}
-                entries.append(Entry.of(Path(entry.path), pardiso, " (Pardiso)"))
-    labels = [entry.label for entry in entries]
-    for entry in entries:
-        if labels.count(entry.label) > 1:
-            raise UsageError(f"two options files are called {entry.label}: rename one")
-        if not any(entry.applies(case) for case in cases):
-            raise UsageError(f"{entry.path} is for none of the scenes, by its header")
-    return entries
-
-
-def compute_reference(case: Case, target: Path) -> dict[str, Any]:
-    """Make sure that the reference of a scene is there; what is known of it.
-
-    A reference in the file is kept if it is one of the same scene. A factorisation that crashes is followed by the
-    iterative method.
-
-    Raises:
-        SolveError: there is none.
-    """
-    from petsc_fs.tools import reference
-
-    if target.exists():
-        found = reference.read(target)
-        if found.scene_digest == reference.digest(case.path):
-            return found.about()
-    said = ""
-    for method in ("auto", "iterative"):
-        command = [sys.executable, "-m", "petsc_fs.tools.reference", case.path, str(target), "--method", method]
-        done = subprocess.run(command, capture_output=True, text=True, env=environment(), check=False)
-        if done.returncode == 0:
-            return reference.read(target).about()
-        said = " ".join(done.stderr.split()[-60:]) or f"exit code {done.returncode}"
-    raise SolveError(f"{case.label}: {said}")
-
-
-def run(
-    cases: Sequence[Case],
-    entries: Sequence[Entry],
-    *,
-    ranks: Sequence[int],
-    rtols: Sequence[float],
-    repeat: int,
-    references: Mapping[str, Path],
-    time_limit: float = 300.0,
-    mpiexec: str | None = None,
-    progress: Callable[[dict[str, Any], list[Record]], None] = lambda *_: None,
-) -> tuple[list[Record], list[dict[str, Any]], bool]:
-    """Measure all combinations, in alternation.
-
-    Args:
-        cases: scenes.
-        entries: options files; each is measured on the scenes that it is for.
-        ranks: numbers of ranks.
-        rtols: tolerances.
-        repeat: number of rounds.
-        references: label of a scene to its reference.
-        time_limit: seconds for each step of a process, see `petsc_fs.tools.measure.Job`.
-        mpiexec: program that starts ranks.
-        progress: called after each process with what was measured and its records.
-
-    Returns:
-        Records; the combinations that were given up after a hang; whether all was measured, or Ctrl-C came first.
-    """
-    records: list[Record] = []
-    given_up: list[dict[str, Any]] = []
-    try:
-        for number, case, n, entry in schedule(cases, entries, ranks, repeat):
-            what = {"scene": case.label, "file": entry.label, "ranks": n}
-            found: list[Record] = []
-            if what not in given_up:
-                job = Job(
-                    scenes=[case.path],
-                    options_file=entry.path,
-                    options=entry.options,
-                    ranks=n,
-                    rtols=rtols,
-                    warm_up=True,
-                    errors=True,
-                    references={case.path: references[case.label]},
-                    history=number == 0,
-                    time_limit=time_limit,
-                )
-                found = [r | what | {"round": number} for r in measure(job, mpiexec=mpiexec)]
-            if any(r["kind"] == "hang" for r in found):
-                given_up.append(what)
-            records += found
-            progress(what, found)
-    except KeyboardInterrupt:
-        if not records:
-            raise
-        return records, given_up, False
-    return records, given_up, True
-
-
-def schedule(
-    cases: Sequence[Case], entries: Sequence[Entry], ranks: Sequence[int], repeat: int
-) -> Iterator[tuple[int, Case, int, Entry]]:
-    """Rounds of all combinations that fit; files take turns at going first."""
-    for number in range(repeat):
-        for case in cases:
-            for n in ranks:
-                fitting = [entry for entry in entries if entry.applies(case)]
-                shift = number % max(len(fitting), 1)
-                for entry in fitting[shift:] + fitting[:shift]:
-                    yield number, case, n, entry
-
-
-def describe_machine() -> dict[str, str]:
-    """Processor, cores, memory and system that measurements were made on."""
-    model = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        names = re.findall(r"^model name\s*: (.*)$", cpuinfo.read_text(encoding="utf-8"), flags=re.MULTILINE)
-        model = names[0] if names else model
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    return {
-        "processor": f"{model}, {cores} core{'s' if cores > 1 else ''}",
-        "memory": f"{memory:.0f} GiB",
-        "system": f"{platform.system()} {platform.release()}",
-        "threads per rank": environment()["OMP_NUM_THREADS"],
-    }
-
-
-def to_csv(records: Sequence[Record]) -> str:
-    """One line for each record; fields and ranks in columns of their own."""
+def to_csv(found: Comparison) -> str:
+    """One line for each record; phases, fields and ranks in columns of their own."""
     rows = []
-    for record in records:
-        row = {k: v for k, v in record.items() if not isinstance(v, dict | list) and k != "repetition"}
-        for name in ("residual_by_field", "error_by_field", "backward_error"):
-            for key, value in (record[name] or {}).items():
-                row[f"{name.removesuffix('_by_field')}_{key}"] = value
-        for name in ("peak_rss", "base_rss"):
-            row[f"{name}_max"] = max(record[name]) if record[name] else None
-        rows.append(row)
-    first = ["scene", "ranks", "file", "round", "rtol", "kind", "iterations"]
-    columns = first + sorted({key for row in rows for key in row} - set(first))
+    for record in found.records:
+        row = {k: v for k, v in record.items() if not isinstance(v, dict | list)}
+        for name, values in record.items():
+            if isinstance(values, dict):
+                row |= {f"{name.removesuffix('_by_field')}_{key}": value for key, value in values.items()}
+            elif isinstance(values, list):
+                row[f"{name}_max"] = max(values)
+        rows.append(row | {"scene": Path(record["scene"]).stem})
+    first = ["scene", "ranks", "variant", "round", "rtol", "kind", "iterations"]
     text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer = csv.DictWriter(text, first + sorted({k for row in rows for k in row} - set(first)), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()
 
 
+# --- the page
+
+STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; color: #1a1a1a; max-width: 68rem; margin: 2rem auto; padding: 0 1rem; }
+table { border-collapse: collapse; margin: .6rem 0 1rem; font-variant-numeric: tabular-nums; font-size: .92rem; }
+th, td { text-align: left; padding: .25rem .7rem; border-bottom: 1px solid #ddd; vertical-align: top; }
+td.n { text-align: right; white-space: nowrap; } img { max-width: 100%; } h2 { border-bottom: 2px solid #0072B2; }
+pre { background: #f5f5f5; padding: .7rem; overflow-x: auto; font-size: .82rem; }
+"""
+
+METHOD = """\
+Each combination of scene, file and number of ranks ran in a process of its own in each round; all combinations came to
+their turn before any did again, in another order each time. A first set-up and solve in each process is not counted.
+One set-up served all tolerances, which replace those of the file. Numbers are medians and, in brackets, quartiles over
+rounds; ratios are of the same round. Forward error: difference from the reference, each field in its own norm (mean
+square weighted with cell volumes, each dimension of cells alike; fluxes by their density), relative to the reference;
+all fields together as their root mean square. True residual: |b − Jx| / |b| of the user's system. MiB: what all
+ranks' memory grew by in set-up and solve. A file is fastest whose forward error is at most that of the row, at whatever
+tolerance that takes; ≈ names files whose quartiles overlap with the fastest one's: between them this measurement does
+not decide."""
+
+
+def page(found: Comparison, everything: Sequence[Point], pictures: Mapping[str, Path]) -> str:
+    """The page: summary, pictures by label of the scene, and how it was measured; it refers to no other file."""
+    import base64
+    import html
+
+    from petsc_fs.tools.pages import hypertext
+
+    title = f"Comparison: {', '.join(case.label for case in found.cases)}"
+    lines = [
+        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>',
+        f"<style>{STYLE}</style></head><body><h1>{html.escape(title)}</h1>",
+    ]
+    if not found.about["complete"]:
+        lines.append("<p><b>Measuring was interrupted:</b> later rounds or combinations are missing.</p>")
+    if found.base:
+        lines += [f"<h2>Against {html.escape(found.base)}</h2>", hypertext(RATIOS, ratio_rows(found, everything))]
+    best = summary(found, everything)
+    if best:
+        lines += ["<h2>Which file is fastest for which accuracy</h2>", hypertext(SUMMARY, best)]
+    for case in found.cases:
+        sizes = ", ".join(f"{name} {size:,}" for name, size in case.sizes.items())
+        steps = f"{case.steps} steps; " if case.steps else ""
+        about = f"{case.model}, {case.dimension}D; {steps}{sum(case.sizes.values()):,} unknowns: {sizes}."
+        lines += [
+            f"<h2>{html.escape(case.label)}</h2>",
+            f"<p>{html.escape(about)}</p>",
+        ]
+        if case.label in pictures:
+            data = base64.b64encode(pictures[case.label].read_bytes()).decode("ascii")
+            lines.append(f'<img alt="Error against seconds" src="data:image/svg+xml;base64,{data}">')
+        if case.reference:
+            words = f"{case.reference['method']}; last correction {case.reference['corrections'][-1]:.0e}, "
+            words += f"componentwise backward error {case.reference['backward_error']['componentwise']:.0e}"
+            lines.append(f"<p>Reference: {html.escape(words)}.</p>")
+        rows = [
+            (
+                *(p.file, p.ranks, "its own" if p.rtol is None else f"{p.rtol:.0e}", f"{p.iterations:g}"),
+                *(f"{p.residual:.1e}", f"{p.error:.1e}", p.seconds["setup"], p.seconds["solve"]),
+                "" if p.converged else "missed the tolerance" if p.ended else "failed in some rounds",
+            )
+            for p in everything
+            if p.scene == case.label
+        ]
+        lines.append(f"<details><summary>All medians</summary>{hypertext(MEDIANS, rows)}</details>")
+    failed = failures(found)
+    lines.append("<h2>What did not converge</h2>")
+    heads = ("scene", "file", "ranks", "outcome", "runs", "said")
+    lines.append(hypertext(heads, failed) if failed else "<p>Every solve met its tolerance.</p>")
+    facts = [[k, f"{v:.3g}" if isinstance(v, float) else v] for k, v in found.about.items()]
+    facts.append(["seconds are", f"{CLOCKS[found.clock]} of the slowest rank"])
+    lines += ["<h2>How this was measured</h2>", f"<p>{METHOD}</p>", hypertext(("", ""), facts)]
+    for variant in found.variants:
+        more = "".join(f"-{k} {v or ''}\n" for k, v in variant.options.items())
+        head = f"<code>{html.escape(variant.label)}</code>: {html.escape(variant.purpose)}"
+        text = html.escape(more + variant.text)
+        lines.append(f"<details><summary>{head}</summary><pre>{text}</pre></details>")
+    return "\n".join([*lines, "</body></html>"]) + "\n"
+
+
+def draw(found: Comparison, everything: Sequence[Point], out: Path) -> dict[str, Path]:
+    """Draw error against seconds for each scene with a reference, on the least number of ranks, as SVG and PNG."""
+    from petsc_fs.tools.plots import plot_work_precision
+
+    pictures = {}
+    ranks = min(found.ranks)
+    for case in found.cases:
+        mine = [p for p in everything if p.scene == case.label and p.ranks == ranks and p.error == p.error]
+        if not mine:
+            continue
+        curves: dict[str, dict[str, list[tuple[float, float]]]] = {heading: {} for heading in SECONDS.values()}
+        for (what, heading), p in itertools.product(SECONDS.items(), mine):
+            curves[heading].setdefault(p.file, []).append((p.seconds[what].median, p.error))
+        where = f"{case.label} on {ranks} rank{'s' if ranks > 1 else ''}"
+        for suffix in ("png", "svg"):
+            target = out / f"work_precision_{case.label}.{suffix}"
+            pictures[case.label] = plot_work_precision(curves, target, where, CLOCKS[found.clock])
+    return pictures
+
+
+# --- the command line
+
 EPILOG = """\
 Scenes come first. Each combination of scene, options file and number of ranks runs in processes of its own; one that
-crashes, hangs or diverges is shown as such. Ctrl-C ends measuring; what was measured is drawn. --out gets
-compare.html, which needs no other file and no network, compare.json and compare.csv with all numbers, and the pictures
-as PNG and SVG. Reference solutions are kept in --out and used again. Single-dash options are PETSc's and go to every
-run (-n RANKS is the exception).
+crashes, hangs or diverges is shown as such. Ctrl-C ends measuring; what was measured is written. --out gets
+compare.html, which needs no other file and no network, compare.json and compare.csv with all numbers, and pictures.
+Reference solutions are kept in --out and used again. An options file may be followed by further options, in quotes.
+Single-dash options are PETSc's and go to every run (-n RANKS is the exception).
 
   petsc-fs compare model1.h5 model2.h5 --repeat 3 --out comparison
-  petsc-fs compare mine.h5 --options direct.opts mine.opts --rtol 1e-2..1e-10:2 -n 1 2 --out comparison
+  petsc-fs compare mine.h5 --options direct.opts "mine.opts -ksp_max_it 50" --rtol 1e-2..1e-10:2 -n 1 2 --out comparison
+  petsc-fs compare mine.h5 run.h5 --base contact_poromechanics.opts --options mine.opts --repeat 5
   petsc-fs compare --again comparison/compare.json --out comparison     # pictures and page only
 
 exit codes: 0 everything was measured, whatever the outcomes; 1 no reference solution; 2 wrong call; 3 no such scene"""
@@ -598,87 +444,143 @@ exit codes: 0 everything was measured, whatever the outcomes; 1 no reference sol
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `petsc-fs compare`."""
+    add = parser.add_argument
     parser.epilog = EPILOG
-    parser.add_argument("scenes", metavar="SCENE", nargs="*", help="file, or name of a bundled scene")
-    parser.add_argument(
-        "--options", nargs="+", metavar="FILE", help="options files; default all shipped ones that fit a scene"
-    )
-    parser.add_argument(
-        "--rtol",
-        default=RTOLS,
-        metavar="A..B",
-        help="tolerances, every decade; or a list with commas; default %(default)s",
-    )
-    parser.add_argument("--ranks", type=int, nargs="+", default=None, metavar="N", help="numbers of ranks; default 1")
-    parser.add_argument("--repeat", type=int, default=5, metavar="N", help="rounds, default %(default)s")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write, made if missing")
-    parser.add_argument(
+    add("scenes", metavar="SCENE", nargs="*", help="scene or sequence: a file, or the name of a bundled one")
+    add("--options", nargs="+", metavar="FILE", help="options files; default all shipped ones that fit a scene")
+    add("--base", metavar="FILE", help="options file whose seconds the others' are set against, in the same round")
+    add("--rtol", metavar="A..B", help=f"tolerances, every decade, or a list with commas; default {RTOLS}, and with "
+        "--base those of the files, without errors")  # fmt: skip
+    add("--ranks", type=int, nargs="+", metavar="N", help="numbers of ranks; default 1")
+    add("--repeat", type=int, default=5, metavar="N", help="rounds, default %(default)s")
+    add("--out", type=Path, metavar="DIR", help="folder to write, made if missing; with --base it may be left away")
+    add(
         "--time-limit",
         type=float,
         default=300.0,
         metavar="S",
         help="seconds for a set-up or solve, default %(default)g",
     )
-    parser.add_argument(
-        "--clock", choices=CLOCKS, help="what seconds are; cpu: processor time, for a machine where others compute"
-    )
-    parser.add_argument("--mpiexec", metavar="PROGRAM", help="that starts ranks; default MPIEXEC or the one on PATH")
-    parser.add_argument("--again", type=Path, metavar="FILE.json", help="draw from an earlier comparison instead")
-
-
-def split_petsc(petsc: Sequence[str]) -> tuple[list[int], dict[str, str | None]]:
-    """Numbers of ranks from `-n`, and PETSc's options by name.
-
-    Raises:
-        UsageError: -n has no number.
-    """
-    groups: list[list[str]] = []
-    for word in petsc:
-        if re.match(r"-[A-Za-z_]", word):
-            groups.append([word[1:]])
-        else:
-            groups[-1].append(word)
-    ranks: list[int] = []
-    found: dict[str, str | None] = {}
-    for name, *values in groups:
-        if name in ("n", "np"):
-            if not values or not all(v.isdecimal() for v in values):
-                raise UsageError(f"-{name}: expected numbers of ranks")
-            ranks = [int(v) for v in values]
-        else:
-            found[name] = " ".join(values) or None
-    return ranks, found
+    add("--clock", choices=CLOCKS, help="what seconds are; cpu: processor time, for a machine where others compute")
+    add("--mpiexec", metavar="PROGRAM", help="that starts ranks; default MPIEXEC or the one on PATH")
+    add("--again", type=Path, metavar="FILE.json", help="draw from an earlier comparison instead")
 
 
 def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
     """Run `petsc-fs compare`."""
     if comm.size > 1:
         raise UsageError("compare starts mpiexec itself: call it without, and give it -n RANKS")
-    out: Path = args.out
-    from petsc_fs.tools import compare_plots
-    from petsc_fs.tools.plots import pyplot
+    if args.out is None and not args.base:
+        raise UsageError("--out: name the folder to write")
+    if args.out is not None:
+        from petsc_fs.tools.plots import pyplot
 
-    pyplot()  # or an error, before anything is measured
+        pyplot()  # or an error, before anything is measured
     if args.again is not None:
         try:
             found = Comparison.from_json(args.again.read_text(encoding="utf-8"))
         except (OSError, ValueError, TypeError, KeyError) as e:
             raise UsageError(f"--again {args.again}: not a comparison: {e}") from e
-        _make_folder(out)
+        _make_folder(args.out)
     else:
-        found = _measure_all(args, petsc)
-    from petsc_fs.tools.compare_page import page, terminal_summary
-
+        found = _measure(args, petsc)
     if args.clock is not None:
         found = replace(found, clock=args.clock)
-
-    pictures = compare_plots.draw(found, out)
-    write_text(out / "compare.csv", to_csv(found.records))
-    write_text(out / "compare.json", found.to_json())
-    write_text(out / "compare.html", page(found, pictures))
-    print(terminal_summary(found))
-    print(f"written: {out / 'compare.html'}, with compare.csv, compare.json and {len(pictures)} pictures beside it")
+    everything = points(found)
+    if found.base:
+        _print(RATIOS, ratio_rows(found, everything))
+    best = summary(found, everything)
+    if best:
+        _print(SUMMARY, best)
+    if args.out is not None:
+        pictures = draw(found, everything, args.out)
+        write_text(args.out / "compare.csv", to_csv(found))
+        write_text(args.out / "compare.json", found.to_json())
+        write_text(args.out / "compare.html", page(found, everything, pictures))
+        print(f"written: {args.out / 'compare.html'}, with compare.csv, compare.json and pictures beside it")
     return 0
+
+
+def _measure(args: argparse.Namespace, petsc: list[str]) -> Comparison:
+    """Measure what the command line asks for, with a line for each process that did not converge."""
+    from petsc_fs.io.bundled import find_scene
+    from petsc_fs.tools import reference
+
+    more_ranks, more = split_ranks(petsc)
+    ranks = tuple(dict.fromkeys(args.ranks or more_ranks or [1]))
+    rtols = () if args.base and not args.rtol else rtols_of(args.rtol or RTOLS)
+    if not args.scenes:
+        raise UsageError("name at least one scene; they come before --options")
+    if min(ranks) < 1 or args.repeat < 1 or args.time_limit <= 0:
+        raise UsageError("--ranks, --repeat and --time-limit must be positive")
+    cases = [Case.of(path) for path in dict.fromkeys(find_scene(name) for name in args.scenes)]
+    variants = _variants(args.options, args.base, cases, more)
+    _unique("scenes", [case.label for case in cases])
+    _unique("options files", [variant.label for variant in variants])
+    if args.out is not None:
+        _make_folder(args.out)
+    started, complete, records = time.time(), True, list[Record]()
+    references: dict[str, str] = {}
+    by_path = {case.path: case for case in cases}
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # batch systems send it when time is up
+    try:
+        for k, case in enumerate(cases if rtols and args.out is not None else ()):
+            if not case.steps:
+                _say(f"reference solution of {case.label}")
+                references[case.path] = os.fspath(args.out / f"reference_{case.label}.npz")
+                cases[k] = replace(case, reference=reference.made(case.path, Path(references[case.path])).about())
+        for found in measure_all(
+            list(by_path),
+            variants,
+            Job(rtols=rtols, warm_up=True, errors=True, references=references, time_limit=args.time_limit),
+            ranks=ranks,
+            repeat=args.repeat,
+            fits=lambda system, variant: variant.fits(tuple(by_path[system].sizes), by_path[system].names),
+            mpiexec=args.mpiexec,
+        ):
+            records += found
+            for r in (r for r in found if r["kind"] != "converged"):
+                where = f"{by_path[r['scene']].label}, {r['variant']}, {r['ranks']} rank(s)"
+                _say(f"{where}: {r['kind']} {r['message'] or r['reason']}")
+    except KeyboardInterrupt:
+        if not records:
+            raise
+        complete = False
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    about = {
+        "command": " ".join(["petsc-fs", *sys.argv[1:]]),
+        "date": time.strftime("%Y-%m-%d %H:%M", time.localtime(started)),
+        "minutes": (time.time() - started) / 60,
+        "complete": complete,
+        "load average at the end": os.getloadavg()[2],
+        **describe_machine(),
+    }
+    how = {"clock": args.clock or "wall", "base": variants[0].label if args.base else ""}
+    return Comparison(tuple(cases), tuple(variants), ranks, rtols, args.repeat, records, about, **how)
+
+
+def _variants(
+    names: Sequence[str] | None, base: str | None, cases: Sequence[Case], more: Mapping[str, str | None]
+) -> list[Variant]:
+    """Options files by path or name of a shipped one, the base first.
+
+    Raises:
+        UsageError: a file is missing or wrong, or one is for none of the scenes.
+    """
+    words = names or [str(file.path) for file in options.shipped()]
+    found = list({v.label: v for v in (Variant.of(w, more) for w in ([base, *words] if base else words))}.values())
+    fitting = [v for v in found if any(v.fits(tuple(c.sizes), c.names) for c in cases)]
+    if names and len(fitting) < len(found):
+        wrong = next(v for v in found if v not in fitting)
+        raise UsageError(f"{wrong.path} is for none of the scenes, by its header")
+    return fitting
+
+
+def _unique(what: str, labels: Sequence[str]) -> None:
+    twice = next((label for label in labels if labels.count(label) > 1), None)
+    if twice is not None:
+        raise UsageError(f"two {what} are called {twice}: rename one, as tables tell them apart by name")
 
 
 def _make_folder(folder: Path) -> None:
@@ -689,61 +591,13 @@ def _make_folder(folder: Path) -> None:
         raise UsageError(f"--out {folder}: cannot be made: {e.strerror}") from e
 
 
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """Let SIGTERM, which batch systems send when time is up, do what Ctrl-C does."""
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
 
 
-def _measure_all(args: argparse.Namespace, petsc: list[str]) -> Comparison:
-    """Measure what the command line asks for, with live progress."""
-    from petsc_fs.cli.main import versions
-    from petsc_fs.tools.compare_page import Progress
-
-    more_ranks, more = split_petsc(petsc)
-    ranks = tuple(dict.fromkeys(args.ranks or more_ranks or [1]))
-    rtols = rtols_of(args.rtol)
-    if not args.scenes:
-        raise UsageError("name at least one scene; they come before --options")
-    if min(ranks) < 1 or args.repeat < 1 or args.time_limit <= 0:
-        raise UsageError("--ranks, --repeat and --time-limit must be positive")
-    cases = find_cases(args.scenes)
-    entries = find_entries(args.options, cases, more)
-    _make_folder(args.out)
-    total = sum(1 for _ in schedule(cases, entries, ranks, args.repeat))
-    started = time.time()
-    with Progress(total) as progress, _interruptible():
-        references = {}
-        for k, case in enumerate(cases):
-            references[case.label] = args.out / f"reference_{case.label}.npz"
-            progress.say(f"reference solution of {case.label}")
-            cases[k] = replace(case, reference=compute_reference(case, references[case.label]))
-        records, given_up, complete = run(
-            cases,
-            entries,
-            ranks=ranks,
-            rtols=rtols,
-            repeat=args.repeat,
-            references=references,
-            time_limit=args.time_limit,
-            mpiexec=args.mpiexec,
-            progress=progress.update,
-        )
-    about = {
-        "date": time.strftime("%Y-%m-%d %H:%M", time.localtime(started)),
-        "seconds": time.time() - started,
-        "complete": complete,
-        "load": os.getloadavg()[2],
-        "time_limit": args.time_limit,
-        "machine": describe_machine(),
-        "versions": versions(),
-    }
-    return Comparison(tuple(cases), tuple(entries), ranks, rtols, args.repeat, records, given_up, about)
+def _print(headings: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    """A table for the terminal, in columns as wide as they need."""
+    cells = [[str(c) for c in row] for row in (headings, *rows)]
+    widths = [max(len(row[k]) for row in cells) for k in range(len(headings))]
+    for row in cells:
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())

@@ -38,17 +38,20 @@ against the condition but not against the scheme.
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from petsc_fs.errors import SceneError
+from petsc_fs.errors import SceneError, SolveError
 from petsc_fs.scene import CSR, Scene, diagonal_blocks, gather_rows
+from petsc_fs.tools.reference import factors, one_block, rows_of
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Value = TypeVar("Value")
 
 NOISE = 1e-12
 """Entries of the contact rows below this part of their row's largest are rounding."""
@@ -73,66 +76,39 @@ FORMULAS = {
 class ContactRows:
     """The numbers in the linearised contact conditions, per fracture cell, in the units of the scene.
 
-    NaN stands where a number does not belong to the state of a cell.
-
-    Attributes:
-        closed, sticking, sliding: the branches that the rows take; a cell with neither of the last two is
-            free tangentially.
-        area: of the cells.
-        constant: c, traction per length; NaN if no cell is closed.
-        beta_b: on closed cells; 0 without elastic closure (K_n = 0).
-        slip: |d[u]_tau| of sticking cells, which assumption:sticking_ut_zero wants to vanish.
-        bound: friction bound b of sticking cells, a traction.
-        trial: |y| of sliding cells, a traction.
-        mismatch: epsilon of sliding cells, a traction: y . lambda_tau / |y| - b.
-        friction: Coulomb coefficient, on sliding cells and on sticking ones that slip.
-        jump: (rows of intf_force, contact unknowns) columns are those of J_21 over traction unit and area.
+    NaN stands where a number does not belong to the state of a cell. A cell that neither sticks nor slides is free
+    tangentially.
     """
 
     closed: Mask
     sticking: Mask
     sliding: Mask
-    area: Floats
-    constant: float
-    beta_b: Floats
-    slip: Floats
-    bound: Floats
-    trial: Floats
-    mismatch: Floats
-    friction: Floats
-    jump: CSR
+    area: Floats  # of the cells
+    constant: float  # c, traction per length; NaN if no cell is closed
+    beta_b: Floats  # on closed cells; 0 without elastic closure (K_n = 0)
+    slip: Floats  # |d[u]_tau| of sticking cells, which assumption:sticking_ut_zero wants to vanish
+    bound: Floats  # friction bound b of sticking cells, a traction
+    trial: Floats  # |y| of sliding cells, a traction
+    mismatch: Floats  # epsilon of sliding cells, a traction: y . lambda_tau / |y| - b
+    friction: Floats  # Coulomb coefficient, on sliding cells and on sticking ones that slip
+    jump: CSR  # (rows of intf_force, contact unknowns) columns are those of J_21 over traction unit and area
 
 
 @dataclass(frozen=True, kw_only=True)
 class Contraction:
-    """The convergence condition of one scene, in SI units.
+    """The convergence condition of one scene, in SI units; NaN stands where a value does not apply to a cell."""
 
-    Attributes:
-        terms: per name in `FORMULAS` one value per fracture cell in Pa/m, NaN where it does not apply;
-            without the terms that cannot be evaluated.
-        theorem: per name the value in the condition, with extrema over cells taken as the theorem does.
-        stiffness: lower and upper bound of 4 G D in Pa/m; None if not evaluated.
-        rate: contraction factor q that the theorem promises; None without material data.
-        slip: sliding of sticking cells in m, NaN elsewhere.
-        slip_over_bound: the same times c / b: how far from the friction bound it takes a trial traction.
-        mismatch: epsilon of sliding cells in Pa, NaN elsewhere.
-        mismatch_over_trial: the same over |y|.
-        friction: Coulomb coefficient as far as rows hold it; NaN elsewhere.
-        centers: (fracture cells, 3) in m; None if unknown.
-        notes: assumptions that the scene does not meet, and what could not be evaluated, in words.
-    """
-
-    terms: dict[str, Floats] = field(default_factory=dict)
-    theorem: dict[str, float] = field(default_factory=dict)
-    stiffness: tuple[float, float] | None = None
-    rate: float | None = None
-    slip: Floats = field(default_factory=lambda: np.zeros(0))
-    slip_over_bound: Floats = field(default_factory=lambda: np.zeros(0))
-    mismatch: Floats = field(default_factory=lambda: np.zeros(0))
-    mismatch_over_trial: Floats = field(default_factory=lambda: np.zeros(0))
-    friction: Floats = field(default_factory=lambda: np.zeros(0))
-    centers: Floats | None = None
-    notes: tuple[str, ...] = ()
+    terms: dict[str, Floats] = field(default_factory=dict)  # per name in FORMULAS that is known, Pa/m per fracture cell
+    theorem: dict[str, float] = field(default_factory=dict)  # the same with extrema over cells as the theorem has them
+    stiffness: tuple[float, float] | None = None  # lower and upper bound of 4 G D in Pa/m
+    rate: float | None = None  # contraction factor q that the theorem promises
+    slip: Floats = field(default_factory=lambda: np.zeros(0))  # of sticking cells in m
+    slip_over_bound: Floats = field(default_factory=lambda: np.zeros(0))  # times c / b
+    mismatch: Floats = field(default_factory=lambda: np.zeros(0))  # epsilon of sliding cells in Pa
+    mismatch_over_trial: Floats = field(default_factory=lambda: np.zeros(0))  # over |y|
+    friction: Floats = field(default_factory=lambda: np.zeros(0))  # Coulomb coefficient as far as rows hold it
+    centers: Floats | None = None  # (fracture cells, 3) in m
+    notes: tuple[str, ...] = ()  # assumptions that the scene does not meet, and what could not be evaluated, in words
 
     @property
     def demand(self) -> float | None:
@@ -217,17 +193,18 @@ def evaluate(scene: Scene) -> Contraction:
     notes = _geometry_notes(scene)
     length, stress = _units(scene)
     contact = bool(scene.sizes.get("contact"))
-    terms: dict[str, Floats] = {}
     theorem: dict[str, float] = {} if contact else dict.fromkeys(FORMULAS, 0.0)
-    stiffness = rate = None
+    terms: dict[str, Floats] = {}
     facts: dict[str, Any] = {}
 
-    rows: ContactRows | None = None
-    if contact:
+    def known(what: str, compute: Callable[[], Value]) -> Value | None:
         try:
-            rows = contact_rows(scene)
+            return compute()
         except SceneError as e:
-            notes.append(f"contact terms not evaluated: {e}")
+            notes.append(f"{what} not evaluated: {e}")
+            return None
+
+    rows = known("contact terms", lambda: contact_rows(scene)) if contact else None
     if rows is not None:
         notes += _contact_notes(rows)
         terms, theorem = contact_terms(rows)
@@ -238,25 +215,16 @@ def evaluate(scene: Scene) -> Contraction:
             "mismatch_over_trial": rows.mismatch / rows.trial,
             "friction": rows.friction,
         }
+    stiffness = rate = None
     if scene.material is None:
         notes.append("coupling term, 4 G D and rate not evaluated: the scene has no material data")
     else:
-        try:
-            rate = contraction_rate(scene)
-        except SceneError as e:
-            notes.append(f"rate not evaluated: {e}")
-        if contact:
-            try:
-                coupling = coupling_term(scene)
-                terms = {"coupling": coupling, **terms}
-                theorem = {"coupling": float(np.max(coupling)), **theorem}
-            except SceneError as e:
-                notes.append(f"coupling term not evaluated: {e}")
-            if rows is not None:
-                try:
-                    stiffness = korn_trace(scene, rows)
-                except SceneError as e:
-                    notes.append(f"4 G D not evaluated: {e}")
+        rate = known("rate", lambda: contraction_rate(scene))
+        coupling = known("coupling term", lambda: coupling_term(scene)) if contact else None
+        if coupling is not None:
+            terms, theorem = {"coupling": coupling, **terms}, {"coupling": float(np.max(coupling)), **theorem}
+        if rows is not None:
+            stiffness = known("4 G D", lambda: korn_trace(scene, rows))
     scale = stress / length
     centers = scene.cell_centers.get("contact")
     return Contraction(
@@ -435,54 +403,25 @@ def korn_trace(scene: Scene, rows: ContactRows) -> tuple[float, float]:
 
 def _largest_compliance(scene: Scene, rows: ContactRows) -> float:
     """Largest |[u]| / |traction| over all tractions on the walls of the fractures, norms in L2."""
-    from petsc4py import PETSc
-
     fields = ("intf_force", "momentum")
-    sizes = [scene.sizes[f] for f in fields]
-    parts = {
-        (r, c): PETSc.Mat().createAIJ(
-            (scene.sizes[r], scene.sizes[c]),
-            csr=(b.indptr.astype(PETSc.IntType), b.indices.astype(PETSc.IntType), b.data),
-            comm=PETSc.COMM_SELF,
-        )
-        for r in fields
-        for c in fields
-        if (b := scene.blocks.get((r, c))) is not None
-    }
-    nest = PETSc.Mat().createNest([[parts.get((r, c)) for c in fields] for r in fields], comm=PETSc.COMM_SELF)
-    matrix = nest.convert("aij", PETSc.Mat())
-    pc = PETSc.PC().create(PETSc.COMM_SELF)
-    pc.setOperators(matrix)
-    pc.setType("lu")
-    pc.setOptionsPrefix("petsc_fs_contraction_")
-    if PETSc.Sys.hasExternalPackage("mumps"):
-        pc.setFactorSolverType("mumps")
-    load, answer = matrix.createVecs()
-    jump = rows.jump
-    row_of: NDArray[Any] = np.repeat(np.arange(jump.indptr.size - 1), np.diff(jump.indptr))
+    jump, row_of = rows.jump, rows_of(rows.jump)
     root = np.sqrt(np.repeat(rows.area, scene.dimension))
+    x: Floats = np.random.default_rng(0).standard_normal(root.size)
+    largest = 0.0
     try:
-        pc.setUp()
-        x = np.random.default_rng(0).standard_normal(root.size)
-        largest = 0.0
-        for _ in range(POWER_STEPS):
-            x /= np.linalg.norm(x)
-            force = np.zeros(sum(sizes))
-            np.add.at(force, row_of, jump.data * (root * x)[jump.indices])
-            load.setArray(force)
-            pc.apply(load, answer)
-            opening = np.bincount(jump.indices, jump.data * answer.getArray()[row_of], root.size)
-            x = np.asarray(root * opening)
-            before, largest = largest, float(np.linalg.norm(x))
-            if not np.isfinite(largest):
-                raise SceneError("the walls of the fractures can move without force")
-            if largest - before <= POWER_RTOL * largest:
-                break
-    except PETSc.Error as e:
-        raise SceneError(f"momentum and interface force balance cannot be factorised (PETSc error {e.ierr})") from e
-    finally:
-        for thing in (pc, matrix, nest, load, answer, *parts.values()):
-            thing.destroy()
+        with factors(one_block(scene, fields)) as (inverse, _):
+            for _step in range(POWER_STEPS):
+                force = np.zeros(sum(scene.sizes[f] for f in fields))
+                np.add.at(force, row_of, jump.data * (root * x / np.linalg.norm(x))[jump.indices])
+                opening = np.bincount(jump.indices, jump.data * inverse(force)[row_of], root.size)
+                x = np.asarray(root * opening, dtype=np.float64)
+                before, largest = largest, float(np.linalg.norm(x))
+                if not np.isfinite(largest):
+                    raise SceneError("the walls of the fractures can move without force")
+                if largest - before <= POWER_RTOL * largest:
+                    break
+    except SolveError as e:
+        raise SceneError(f"momentum and interface force balance: {e}") from e
     if largest == 0:
         raise SceneError("tractions do not move the walls of the fractures")
     return largest
@@ -497,7 +436,7 @@ def _jump_operator(scene: Scene, area: Floats) -> tuple[CSR, float]:
         raise SceneError("block (intf_force, contact) is empty")
     per_unknown = np.repeat(area, dim)
     squares = np.bincount(block.indices, block.data**2, cells * dim)
-    rows = np.repeat(np.arange(block.indptr.size - 1), np.diff(block.indptr))
+    rows = rows_of(block)
     significant = np.abs(block.data) > NOISE * np.sqrt(squares)[block.indices]
     walls = np.unique(np.column_stack([block.indices // dim, rows // dim])[significant], axis=0)
     units = np.sqrt(squares / 2) / per_unknown
@@ -519,7 +458,7 @@ def _jump_derivative(scene: Scene, jump: CSR) -> Floats:
     C = np.zeros((cells, dim, dim))
     if block is None:
         return C
-    row_of = np.repeat(np.arange(block.indptr.size - 1), np.diff(block.indptr))
+    row_of = rows_of(block)
     at, counts = gather_rows(jump.indptr, block.indices)
     rows, columns = np.repeat(row_of, counts), jump.indices[at]
     values = np.repeat(block.data, counts) * jump.data[at] / 2

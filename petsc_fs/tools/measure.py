@@ -1,72 +1,67 @@
 """Measure solves in processes of their own, so that a crash, a hang or divergence is an outcome and not the end.
 
-`measure` starts `mpiexec -n RANKS python -m petsc_fs.tools.probe`, which solves one or more scenes by an options file and
-further options, and gives back one *record* for each solve, a dictionary that JSON can hold:
+`measure` starts `mpiexec -n RANKS python -m petsc_fs.tools.probe`, which solves scenes or sequences by an options file
+and further options; `measure_all` does so for all combinations of systems, variants and ranks, in turns. Either gives
+one *record* for each solve, a dictionary that JSON can hold:
 
-    scene              path of the scene, as given
+    scene              path of the scene or sequence, as given
     rtol               relative tolerance asked for; None: as the options say
     repetition         number of the repetition, from 0
     kind               one of `KINDS`, below
     message            one line on what went wrong; "" if nothing did
-    phase              where the process was: "start", "read", "set-up", "solve", "errors" or "history"
+    phase              where the process was: "start", "read", "set-up", "solve" or "errors"
 
-and, where the solve came to an end (kinds converged, stagnated, diverged and unused_option; else None):
+and, where the solve came to an end (kinds converged, stagnated, diverged and unused_option; else None), summed over the
+steps of a sequence where that makes sense, the worst of them else:
 
     iterations         of the outer Krylov method
     reason             PETSc's name for why it stopped, for example "CONVERGED_RTOL"
-    limited_by_rounding  whether the residual cannot be told from rounding, though the tolerance is not met
     tolerance          what the true residual was held against
-    read_seconds       reading the scene: the same for all records of a scene and process
-    setup_seconds      PETSc's matrices and the preconditioner: once for all tolerances of a repetition
-    solve_seconds      the Krylov method
-    cpu_seconds        processor time of set-up and solve, the busiest rank's: less noisy where others compute, too
-    cpu_by_phase       the same of each phase: {"read": ..., "setup": ..., "solve": ...}
-    true_residual      |b - J x| / |b| of the untransformed system
-    residual_by_field  the same, restricted to each field
+    seconds            {"read": ..., "setup": ..., "solve": ...}, by the clock; set-up is one for all tolerances
+    cpu_seconds        the same of the processor: less noisy where others compute, too
+    true_residual      |b - J x| / |b| of the user's system
+    residual_by_field  |r_f| / |b| of each field
     base_rss           list, per rank: bytes of resident memory with the scene read, before any PETSc object
     peak_rss           list, per rank: most bytes since then; from the second repetition on, errors count with it
-    fallback           rung of -petsc_fs_fallback that found the solution; "" if none was needed
-    direct             whether the outermost preconditioner is a factorisation of the whole matrix
 
-and, where the job names references or asks for errors (else None; see `petsc_fs.tools.accuracy`):
+and, where the job names references or asks for errors (else None; see `petsc_fs.tools.reference`):
 
     forward_error      against the reference, all fields in one number
     error_by_field     the same per field, each in its natural norm, relative to the reference
     backward_error     {"normwise": ..., "componentwise": ..., "fieldwise": ...}
 
-and, where the job asks for a history, on the records of the last repetition with the least tolerance (else None):
-
-    history            {"seconds": [...], "residual": [...], "residual_by_field": {field: [...]},
-                        "forward_error": [...], "error_by_field": {field: [...]}, "cpu_seconds": [...]}, all by
-                       iteration, from 0; seconds are those of the timed solve, errors of a second one
-
-Times are wall-clock, the slowest rank's. Where a solve crashes, records of those before it are kept.
+Times are the slowest rank's. Where a solve crashes, records of those before it are kept.
 """
 
 from __future__ import annotations
 
 import ctypes
+import itertools
 import json
 import os
+import platform
 import re
+import shlex
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from petsc_fs import options as options_files
 from petsc_fs.errors import UsageError
 
 Record = dict[str, Any]
+Path_ = str | os.PathLike[str]
 
 KINDS = {
-    "converged": "the true residual meets the tolerance",
-    "stagnated": "the method stopped, without blowing up, before the true residual met the tolerance",
+    "converged": "the verdict of the solver is that the solution is one",
+    "stagnated": "the method stopped, without blowing up, at what the verdict does not accept",
     "diverged": "the residual grew by the tolerance for divergence, or is not finite",
     "failed": "PETSc reported an error in set-up or solve",
     "refused": "an option has an impossible value, or the file does not fit the scene",
@@ -78,34 +73,21 @@ KINDS = {
 """Outcomes, and what each means."""
 
 EMPTY: Record = dict.fromkeys(
-    (
-        "iterations",
-        "reason",
-        "limited_by_rounding",
-        "tolerance",
-        "read_seconds",
-        "setup_seconds",
-        "solve_seconds",
-        "cpu_seconds",
-        "cpu_by_phase",
-        "true_residual",
-        "residual_by_field",
-        "peak_rss",
-        "base_rss",
-        "fallback",
-        "direct",
-        "forward_error",
-        "error_by_field",
-        "backward_error",
-        "history",
-    )
+    "iterations reason tolerance seconds cpu_seconds true_residual residual_by_field peak_rss base_rss "
+    "forward_error error_by_field backward_error".split()
 )
 """The keys that only a solve that ended fills."""
+
+CLOCKS = {"wall": "wall clock", "cpu": "processor time"}
+"""What seconds can be. Processor time, the busiest rank's, is steadier where other programs run, but hides what waits
+for others."""
 
 GRACE = 5.0
 """Seconds that mpiexec has to end its ranks before it is killed."""
 POLL = 0.02
 """Seconds between looks at a running process."""
+DEATH_SIGNAL = 1
+"""PR_SET_PDEATHSIG of Linux: by which a process ends with its parent."""
 
 MEMORY = re.compile(
     r"out of memory|MemoryError|bad_alloc|cannot allocate memory|Memory requested|INFOG\(1\)=-(?:9|13|19)\b",
@@ -117,40 +99,33 @@ SIGNAL = re.compile(r"exited on signal (\d+)|Caught signal number (\d+)|\(signal
 """How Open MPI, PETSc and MPICH name the signal that ended a rank."""
 
 
+def seconds_of(record: Record, clock: str = "wall") -> dict[str, float]:
+    """Seconds of a record by phase: "read", "setup" and "solve"; and "total", of the last two."""
+    found = record["seconds" if clock == "wall" else "cpu_seconds"]
+    return {**found, "total": found["setup"] + found["solve"]}
+
+
+def grown(record: Record) -> int:
+    """Bytes that all ranks' memory grew by in set-up and solve."""
+    return sum(record["peak_rss"]) - sum(record["base_rss"])
+
+
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """What one process measures: each scene, with each tolerance, repeated.
+    """What one process measures: each scene, with each tolerance, repeated."""
 
-    Attributes:
-        scenes: files.
-        options_file: path; None for the smallest solver for each scene, as `petsc-fs solve` chooses it.
-        options: further PETSc options without the dash, which win over the file; None where there is no value.
-        ranks: number of MPI ranks.
-        rtols: relative tolerances, solved for with one set-up; they win over -ksp_rtol, -ksp_atol (which is then 0)
-            and -petsc_fs_true_rtol. Empty: as the options say.
-        repetitions: set-ups and solves of each scene.
-        warm_up: whether one more set-up and solve goes before, unrecorded, so that no time goes to loading libraries.
-        errors: whether backward errors are computed; forward errors too where there is a reference.
-        references: scene to a file of `petsc_fs.tools.reference.write`.
-        history: whether the last solve of each scene is done once more for its errors by iteration.
-        time_limit: seconds for each step: start and reading, set-up, one solve, errors.
-        memory_limit: bytes of address space that each rank may have; None for what the system allows.
-        keep_going: whether the process goes on with the next scene after an error that all ranks raised.
-    """
-
-    scenes: Sequence[str | os.PathLike[str]]
-    options_file: str | os.PathLike[str] | None = None
-    options: Mapping[str, str | None] = field(default_factory=dict)
+    scenes: Sequence[Path_] = ()  # files; sequences are replayed as a run would solve them
+    options_file: Path_ | None = None  # None for the default solver of each scene, as `petsc-fs solve` chooses it
+    options: Mapping[str, str | None] = field(default_factory=dict)  # without the dash, which win over the file
     ranks: int = 1
-    rtols: Sequence[float] = ()
-    repetitions: int = 1
-    warm_up: bool = False
-    errors: bool = False
-    references: Mapping[str, str | os.PathLike[str]] = field(default_factory=dict)
-    history: bool = False
-    time_limit: float = 300.0
-    memory_limit: int | None = None
-    keep_going: bool = False
+    rtols: Sequence[float] = ()  # of solves after one set-up; they win over -ksp_rtol and -ksp_atol, which is then 0
+    repetitions: int = 1  # set-ups and solves of each scene
+    warm_up: bool = False  # whether an unrecorded solve goes before, so that no time goes to loading libraries
+    errors: bool = False  # whether backward errors are computed; forward errors too where there is a reference
+    references: Mapping[str, Path_] = field(default_factory=dict)  # scene to file of `petsc_fs.tools.reference.write`
+    time_limit: float = 300.0  # seconds for each step: start and reading, set-up, one solve, errors
+    memory_limit: int | None = None  # bytes of address space that each rank may have
+    keep_going: bool = False  # whether the next scene follows after an error that all ranks raised
 
     def to_json(self) -> str:
         """What the measured process reads."""
@@ -162,7 +137,122 @@ class Job:
         return cls(**json.loads(text))
 
 
-def measure(job: Job, *, mpiexec: str | os.PathLike[str] | None = None) -> list[Record]:
+@dataclass(frozen=True)
+class Variant:
+    """One way to solve: an options file, perhaps with further options."""
+
+    label: str  # what tables call it
+    path: str = ""  # of the file; "" for the default solver of each scene
+    options: Mapping[str, str | None] = field(default_factory=dict)  # without the dash, which win over the file
+    fields: tuple[str, ...] = ()  # that a scene must have; empty if any will do
+    not_for: tuple[str, ...] = ()  # models that it is known to fail on
+    purpose: str = ""  # first line of the file
+    text: str = ""  # the file, verbatim
+
+    @classmethod
+    def of(cls, words: str, more: Mapping[str, str | None] | None = None) -> Variant:
+        """Read "FILE -option value ...", with further options that all variants have.
+
+        Raises:
+            UsageError: the file is missing, or PETSc would not understand it.
+        """
+        name, *own = shlex.split(words)
+        path = options_files.find_options_file(name)
+        options_files.parse(path)
+        header = options_files.read_header(path)
+        label, chosen = " ".join([path.stem, *own]), {**(more or {}), **petsc_options(own)}
+        text = path.read_text(encoding="utf-8")
+        return cls(label, str(path), chosen, header.fields, header.not_for, header.purpose, text)
+
+    def fits(self, fields: Sequence[str], names: Sequence[str] = ()) -> bool:
+        """Whether it is for a scene with these fields, known by these names, as far as its header says."""
+        return (not self.fields or set(self.fields) == set(fields)) and not set(names) & set(self.not_for)
+
+
+def petsc_options(words: Sequence[str]) -> dict[str, str | None]:
+    """PETSc's options by name, without the dash, from words of a command line."""
+    found: dict[str, list[str]] = {}
+    last = ""
+    for word in words:
+        if re.match(r"-[A-Za-z_]", word):
+            last = word[1:]
+            found[last] = []
+        elif last:
+            found[last].append(word)
+        else:
+            raise UsageError(f"{word!r} is not an option; options start with '-'")
+    return {name: " ".join(values) or None for name, values in found.items()}
+
+
+def split_ranks(petsc: Sequence[str]) -> tuple[list[int], dict[str, str | None]]:
+    """Numbers of ranks from `-n`, and PETSc's other options by name.
+
+    Raises:
+        UsageError: -n has no number.
+    """
+    found = petsc_options(petsc)
+    ranks: list[int] = []
+    for name in ("n", "np"):
+        if name in found:
+            values = (found.pop(name) or "").split()
+            if not values or not all(v.isdecimal() and int(v) for v in values):
+                raise UsageError(f"-{name}: expected numbers of ranks")
+            ranks = [int(v) for v in values]
+    return ranks, found
+
+
+def measure_all(
+    systems: Sequence[Path_],
+    variants: Sequence[Variant],
+    job: Job,
+    *,
+    ranks: Sequence[int] = (1,),
+    repeat: int = 1,
+    fits: Callable[[str, Variant], bool] = lambda system, variant: True,
+    batch: bool = False,
+    mpiexec: Path_ | None = None,
+) -> Iterator[list[Record]]:
+    """Measure all combinations, in turns: each once before any is measured again, the first variant another each time.
+
+    So that noise of the machine falls on all alike, and ratios are of what was measured at about the same time.
+
+    Args:
+        systems: scenes and sequences.
+        variants: to solve them by.
+        job: all that is the same; scenes, options and ranks are put in.
+        ranks: numbers of ranks.
+        repeat: rounds.
+        fits: whether a variant is to be measured on a system.
+        batch: whether a process takes all systems, one after the other, and not one alone.
+        mpiexec: program that starts ranks.
+
+    Yields:
+        The records of a process, with `variant` (its label), `ranks` and `round` beside what `measure` gives. A
+        combination that hung is not measured in later rounds.
+    """
+    names = [os.fspath(s) for s in systems]
+    hung: set[tuple[str, str, int]] = set()
+    groups = [names] if batch else [[name] for name in names]
+    for number, group, n in itertools.product(range(repeat), groups, ranks):
+        shift = number % max(len(variants), 1)
+        for v in [*variants[shift:], *variants[:shift]]:
+            left = [s for s in group if fits(s, v) and (s, v.label, n) not in hung]
+            while left:
+                references = {s: job.references[s] for s in left if s in job.references}
+                what: dict[str, Any] = {
+                    "options_file": v.path or None,
+                    "options": v.options,
+                    "ranks": n,
+                    "references": references,
+                }
+                found = measure(replace(job, scenes=left, **what), mpiexec=mpiexec)
+                hung |= {(r["scene"], v.label, n) for r in found if r["kind"] == "hang"}
+                yield [r | {"variant": v.label, "ranks": n, "round": number} for r in found]
+                done = {r["scene"] for r in found}
+                left = [s for s in left if s not in done]
+
+
+def measure(job: Job, *, mpiexec: Path_ | None = None) -> list[Record]:
     """Measure in a process of its own and say how it ended.
 
     Blocks until the process has ended or was ended. Whatever happens in it is in the records; where it did not come
@@ -183,17 +273,10 @@ def measure(job: Job, *, mpiexec: str | os.PathLike[str] | None = None) -> list[
         events, request, output = (Path(folder) / name for name in ("events", "job.json", "output"))
         request.write_text(job.to_json(), encoding="utf-8")
         events.touch()
-        command = [
-            *launcher(job.ranks, mpiexec),
-            sys.executable,
-            "-m",
-            "petsc_fs.tools.probe",
-            str(request),
-            str(events),
-        ]
+        program = [sys.executable, "-m", "petsc_fs.tools.probe", str(request), str(events)]
         with output.open("wb") as sink:
             process = subprocess.Popen(
-                command,
+                [*launcher(job.ranks, mpiexec), *program],
                 stdin=subprocess.DEVNULL,
                 stdout=sink,
                 stderr=subprocess.STDOUT,
@@ -210,13 +293,12 @@ def measure(job: Job, *, mpiexec: str | os.PathLike[str] | None = None) -> list[
 
 
 _LIBC = ctypes.CDLL(None)
-_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG
 
 
 def _end_with_parent() -> None:
     """In a process that is about to become mpiexec: let it end where this one is killed. Linux only."""
     if sys.platform == "linux":
-        _LIBC.prctl(_DEATH_SIGNAL, signal.SIGTERM)
+        _LIBC.prctl(DEATH_SIGNAL, signal.SIGTERM)
 
 
 def _wait(process: subprocess.Popen[bytes], events: Path, time_limit: float) -> bool:
@@ -283,7 +365,8 @@ def _explain_end(code: int | None, said: str, time_limit: float, phase: str) -> 
         return "out_of_memory", shortage or f"the system killed the process, as for want of memory; in phase {phase}"
     if number in set(signal.Signals):
         return "crash", f"{signal.Signals(number).name} in phase {phase}"
-    telling = [line for line in lines if re.search("error|exception|abort", line, re.IGNORECASE)] or lines
+    telling = [line for line in lines if re.match(r"[\w.]*(Error|Exception|Exit)\b", line)]
+    telling = telling or [line for line in lines if re.search("error|exception|abort", line, re.IGNORECASE)] or lines
     return "crash", f"exit code {code} in phase {phase}: {telling[-1] if telling else 'no output'}"
 
 
@@ -295,7 +378,7 @@ def _signal_number(code: int, said: str) -> int:
     return -code if code < 0 else code - 128 if 128 < code < 192 else 0
 
 
-def launcher(ranks: int, mpiexec: str | os.PathLike[str] | None = None) -> list[str]:
+def launcher(ranks: int, mpiexec: Path_ | None = None) -> list[str]:
     """Command that starts a program on some ranks.
 
     Raises:
@@ -331,3 +414,19 @@ def environment() -> dict[str, str]:
     paths = [here, *kept.get("PYTHONPATH", "").split(os.pathsep)]
     defaults = {"OMP_NUM_THREADS": "1", "MPIEXEC": _mpiexec_beside_python() or "mpiexec"}
     return defaults | kept | {"PYTHONPATH": os.pathsep.join(p for p in paths if p)}
+
+
+def describe_machine() -> dict[str, str]:
+    """Processor, cores, memory, system and versions that measurements were made with."""
+    from petsc_fs.io.bundled import versions
+
+    cpuinfo = Path("/proc/cpuinfo")
+    said = cpuinfo.read_text(encoding="utf-8") if cpuinfo.exists() else ""
+    model = re.findall(r"^model name\s*: (.*)$", said, flags=re.MULTILINE) or [platform.processor()]
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    return {
+        "processor": f"{model[0]}, {os.cpu_count()} cores, {memory:.0f} GiB",
+        "system": f"{platform.system()} {platform.release()}",
+        "threads per rank": environment()["OMP_NUM_THREADS"],
+        "versions": ", ".join(f"{name} {number}" for name, number in versions().items()),
+    }

@@ -221,3 +221,124 @@ def _draw_cells(figure: Any, place: Any, centers: Floats, states: Integers) -> N
         for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
             axis.get_major_locator().set_params(nbins=3)
         axes.set_box_aspect(axes.get_box_aspect() if hasattr(axes, "get_box_aspect") else None, zoom=0.8)  # room for it
+
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Okabe and Ito's palette, which people with colour blindness can tell apart."""
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+DASHES = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (6, 1.5, 1.2, 1.5)), (0, (3, 1)))
+OUTCOME_COLOURS = {"right": "#0072B2", "refusal": "#F0E442", "wrong": "#D55E00", "hang": "#CC79A7", "crash": "#000000"}
+MARKS = {"refusal": "–", "wrong": "×", "hang": "∞", "crash": "!"}
+"""What stands in a field of the matrix, for whom colours are not enough."""
+
+
+def look(number: int) -> dict[str, Any]:
+    """Colour, marker and dashes of a curve, which together tell 280 of them apart."""
+    colour, marker, dashes = (c[number % len(c)] for c in (COLOURS, MARKERS, DASHES))
+    return {"color": colour, "marker": marker, "linestyle": dashes, "markersize": 5, "linewidth": 1.5}
+
+
+def plot_work_precision(
+    curves: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]],
+    path: str | os.PathLike[str],
+    title: str,
+    seconds: str,
+) -> Path:
+    """Draw error against seconds, a panel each for what counts as seconds.
+
+    Args:
+        curves: title of a panel to label to points, seconds and error.
+        path: of the picture.
+        title: above it.
+        seconds: what they are, for the axes.
+
+    Raises:
+        UsageError: matplotlib is missing, or the picture cannot be written.
+    """
+    plt = pyplot()
+    figure, panels = plt.subplots(1, len(curves), figsize=(9.2, 4.6), sharey=True, squeeze=False, layout="constrained")
+    labels = list(dict.fromkeys(label for panel in curves.values() for label in panel))
+    for axes, (heading, panel) in zip(panels[0], curves.items(), strict=True):
+        for label, points in panel.items():
+            x, y = zip(*points, strict=True)
+            axes.plot(x, np.maximum(y, 1e-17), label=label, **look(labels.index(label)))
+        axes.set(xscale="log", yscale="log", xlabel=f"seconds ({seconds})")
+        axes.set_title(heading, loc="left", fontsize=10)
+        axes.grid(color="#DDDDDD")
+    panels[0][0].set_ylabel("forward error, all fields (1)")
+    figure.suptitle(title, fontsize=11)
+    handles, names = panels[0][0].get_legend_handles_labels()
+    columns = max(1, min(len(names), int(100 / max(map(len, names), default=1))))
+    figure.legend(handles, names, loc="outside lower center", ncols=columns, frameon=False, fontsize=8)
+    return _save(figure, Path(path))
+
+
+def plot_matrix(
+    cases: Sequence[Mapping[str, Any]], findings: Sequence[Mapping[str, Any]], outcomes: Sequence[str], path: Path
+) -> Path:
+    """Draw outcomes: a row for each case under its group, a column for each options file and number of ranks.
+
+    Raises:
+        UsageError: matplotlib is missing, or the picture cannot be written.
+    """
+    plt = pyplot()
+    from matplotlib.colors import ListedColormap
+    from matplotlib.patches import Patch
+
+    columns = list(dict.fromkeys((f["file"], f["ranks"]) for f in findings))
+    rows: list[str] = []
+    for group in dict.fromkeys(case["group"] for case in cases):
+        rows += [f"[{group}]", *(case["name"] for case in cases if case["group"] == group)]
+    grid = np.full((len(rows), len(columns)), np.nan)
+    figure, axes = plt.subplots(figsize=(3.2 + 0.2 * len(columns), 3.0 + 0.145 * len(rows)), layout="constrained")
+    for f in findings:
+        i, j = rows.index(f["case"]), columns.index((f["file"], f["ranks"]))
+        grid[i, j] = outcomes.index(f["outcome"])
+        colour = "black" if f["outcome"] == "refusal" else "white"
+        axes.text(j, i, MARKS.get(f["outcome"], ""), ha="center", va="center", fontsize=7, color=colour)
+    shades = ListedColormap([OUTCOME_COLOURS[name] for name in outcomes])
+    axes.imshow(grid, cmap=shades, vmin=-0.5, vmax=len(outcomes) - 0.5, aspect="auto", interpolation="none")
+    axes.set_yticks(range(len(rows)), rows, fontsize=8)
+    names = [f"{file.removesuffix('.opts')}, {n}" for file, n in columns]
+    axes.set_xticks(range(len(columns)), names, rotation=90, fontsize=7)
+    axes.xaxis.tick_top()
+    axes.tick_params(length=0)
+    axes.set_xlabel("options file, ranks")
+    axes.set_xticks(np.arange(1, len(columns)) - 0.5, minor=True)
+    axes.set_yticks(np.arange(1, len(rows)) - 0.5, minor=True)
+    axes.grid(which="minor", color="white", linewidth=0.6)
+    handles = [Patch(facecolor=OUTCOME_COLOURS[name], label=f"{name} {MARKS.get(name, '')}") for name in outcomes]
+    handles.append(Patch(facecolor="white", edgecolor="grey", label="not for these fields"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    return _save(figure, path)
+
+
+def plot_front(
+    groups: Mapping[str, Sequence[tuple[float, float]]], names: tuple[str, str], title: str, path: Path
+) -> Path:
+    """Draw trials of a sweep by two ratios to the base file.
+
+    Args:
+        groups: what they are called in the legend, to their ratios.
+        names: what the ratios are of.
+        title: above the picture.
+        path: of it.
+
+    Raises:
+        UsageError: matplotlib is missing, or the picture cannot be written.
+    """
+    plt = pyplot()
+    figure, axes = plt.subplots(figsize=(6, 4.6), layout="constrained")
+    for k, (name, points) in enumerate(groups.items()):
+        style = look(k) | {"linestyle": "none", "markersize": 4 + 3 * k, "alpha": 0.8}
+        axes.plot([x for x, _ in points], [y for _, y in points], label=f"{name} ({len(points)})", **style)
+    values = [point for points in groups.values() for point in points]
+    for k, scale in enumerate((axes.set_xscale, axes.set_yscale)):
+        if max(v[k] for v in values) > 10 * min(v[k] for v in values):
+            scale("log")
+    axes.set_xlabel(f"{names[0]} / {names[0]} of the base file")
+    axes.set_ylabel(f"{names[1]} / {names[1]} of the base file")
+    axes.set_title(title, fontsize=10)
+    axes.grid(color="#DDDDDD")
+    axes.legend(fontsize=8)
+    return _save(figure, path)

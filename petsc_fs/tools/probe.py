@@ -1,13 +1,12 @@
-"""The process that `petsc_fs.tools.measure` starts: it solves what a job says, and writes what it finds, event by event.
+"""The process that `petsc_fs.tools.measure` starts: it solves what a job says, and writes what it finds.
 
-Run as `mpiexec -n RANKS python -m petsc_fs.tools.probe JOB.json EVENTS`. An event is a JSON object on a line of its own: a
-finished record (with a `kind`, see `petsc_fs.tools.measure`), further entries of the record with number `supplement`, or
-else where the process is (`phase`).
+Run as `mpiexec -n RANKS python -m petsc_fs.tools.probe JOB.json EVENTS`. An event is a JSON object on a line: a
+finished record (with a `kind`, see `petsc_fs.tools.measure`), further entries of the record with number `supplement`,
+or else where the process is (`phase`).
 """
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import json
 import os
@@ -16,42 +15,46 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
-
+from petsc_fs import memory, options
 from petsc_fs.errors import PetscFsError, UsageError, together
-from petsc_fs.tools.measure import MEMORY, Job, Record
+from petsc_fs.tools.measure import DEATH_SIGNAL, MEMORY, Job, Path_, Record
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
+    from petsc_fs.partition import Layout
     from petsc_fs.scene import Scene
     from petsc_fs.solver import Result, Solver
-    from petsc_fs.system import FieldArrays
+
+Value = TypeVar("Value")
 
 SECONDS_TO_AGREE = 5.0
 """How long a rank that failed waits for the others to fail."""
-
-DEATH_SIGNAL = 1
-"""PR_SET_PDEATHSIG of Linux: no rank outlives mpiexec."""
+WARM_UP_STEPS = 2
+"""Of a sequence: so many that a solver has been updated."""
 
 
 def main() -> int:
     """Run the job that the command line names. Collective on all ranks."""
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(DEATH_SIGNAL, signal.SIGKILL)
+        ctypes.CDLL(None).prctl(DEATH_SIGNAL, signal.SIGKILL)  # no rank outlives mpiexec
     job = Job.from_json(Path(sys.argv[1]).read_text(encoding="utf-8"))
     import petsc4py
 
-    petsc4py.init(["petsc-fs"])
+    petsc4py.init(["petsc-fs", "-skip_petscrc", "-options_left", "no"])
     from mpi4py import MPI
 
     comm = MPI.COMM_WORLD
     if job.memory_limit is not None:
         resource.setrlimit(resource.RLIMIT_AS, (job.memory_limit, job.memory_limit))
+    memory.return_freed()
     log = Log(Path(sys.argv[2]), comm)
     try:
         for scene in job.scenes:
@@ -97,33 +100,31 @@ class Log:
 
 
 class Probe:
-    """One scene of a job, on all ranks."""
+    """One scene or sequence of a job, on all ranks."""
 
-    def __init__(self, job: Job, scene: str | os.PathLike[str], comm: MPI.Intracomm, log: Log) -> None:
+    def __init__(self, job: Job, scene: Path_, comm: MPI.Intracomm, log: Log) -> None:
         self.job, self.path, self.comm, self.log = job, Path(scene), comm, log
-        self.rtols = job.rtols or (None,)
+        self.rtols: Sequence[float | None] = job.rtols or (None,)
         self.inserted: list[str] = []
+        self.steps: list[tuple[Scene, Layout, float | None]] = []  # with the tolerance that the run had
+        self.solver: Solver | None = None
         self.judge: Judge | None = None  # on rank 0, once there are solutions
 
     def run(self) -> bool:
-        """Measure all repetitions; whether all ended by a verdict on the residual. Collective."""
+        """Measure all repetitions; whether all ended by a verdict. Collective."""
         self.log.phase("read", scene=os.fspath(self.path), repetition=0, rtol=self.rtols[0])
         try:
             self._read()
-            if self.job.warm_up:
-                self._warm_up()
-            for repetition in range(self.job.repetitions):
-                if not self._repeat(repetition):
-                    return False
+            fine = all(self._repeat(k) for k in range(-1 if self.job.warm_up else 0, self.job.repetitions))
         except (PetscFsError, MemoryError) as e:
             if not self._all_failed():
                 self.log.last_words(_explain(e))
                 self.comm.Abort(1)
             self.log.record(_explain(e))
-            return False
-        finally:
-            self._remove_options()
-        return True
+            fine = False
+        self._forget()
+        options.delete_all(self.inserted)
+        return fine
 
     def _all_failed(self) -> bool:
         """Whether all ranks come here soon, or else others wait for this one in vain."""
@@ -134,152 +135,137 @@ class Probe:
             time.sleep(0.01)
         return True
 
-    def _read(self) -> None:
-        """Put the options for the scene into the database, and read it. Collective."""
+    def _timed(self, action: Callable[[], Value]) -> tuple[Value, tuple[float, float]]:
+        """What an action gives, and its seconds by the clock and of the processor, the slowest rank's. Collective."""
         from mpi4py import MPI
-        from petsc4py import PETSc
 
-        from petsc_fs import options
+        self.comm.Barrier()
+        wall, cpu = time.perf_counter(), time.process_time()
+        value = action()
+        taken = time.perf_counter() - wall, time.process_time() - cpu
+        return value, (self.comm.allreduce(taken[0], op=MPI.MAX), self.comm.allreduce(taken[1], op=MPI.MAX))
+
+    def _read(self) -> None:
+        """Put the options for the scene into the database, and read it, or all steps. Collective."""
+        from petsc_fs.io import hdf5, sequence
+
+        with together(self.comm):
+            steps = sequence.read_contents(self.path).steps if sequence.is_sequence(self.path) else ()
+            self._insert_options(steps[0].sizes if steps else hdf5.read_sizes(self.path)[1])
+        self.given = list(self.inserted)
+        self.is_sequence = bool(steps)
+        self.steps, self.read_seconds = self._timed(lambda: self._read_steps(steps))
+        memory.reset_peak()
+        self.base = self.comm.allgather(memory.held())
+
+    def _read_steps(self, steps: Sequence[Any]) -> list[tuple[Scene, Layout, float | None]]:
+        """The scene, or all of its steps; cells stay on their ranks as long as fields keep their sizes. Collective."""
+        from petsc_fs.io import sequence
         from petsc_fs.io.reader import read_distributed
         from petsc_fs.partition import chosen
 
-        with together(self.comm):
-            self.given = self._options()
-        self.comm.Barrier()
-        started, cpu = MPI.Wtime(), time.process_time()
-        self.scene, self.layout = read_distributed(self.path, self.comm, *chosen(), index_type=PETSc.IntType)
-        self.read_seconds = self._slowest(MPI.Wtime() - started)
-        self.read_cpu = self._slowest(time.process_time() - cpu)
-        if self.job.options_file is None:
-            from petsc_fs.cli.main import tree_for
+        found: list[tuple[Scene, Layout, float | None]] = []
+        layout: Layout | None = None
+        for step in steps or [None]:
+            find: Any = nullcontext if step is None else partial(sequence.find_step, step=step.index)
+            if step is not None and layout is not None and _sizes(layout) != {f: n for f, n in step.sizes.items() if n}:
+                layout = None
+            scene, layout = read_distributed(self.path, self.comm, *chosen(), layout=layout, find=find)
+            found.append((scene, layout, None if step is None else step.run.get("forcing")))
+        return found
 
-            self._insert(tree_for(self.scene, self.comm).options)
-        options.insert_all({"options_left": "no"})
-        reset_peak()
-        self.base = self.comm.allgather(resident())
-
-    def _options(self) -> list[str]:
-        """Put the job's options into the database, the file's after those that win over it; their names. Local."""
-        from petsc_fs import options
-        from petsc_fs.io import hdf5
-
-        sizes = hdf5.read_sizes(self.path)[1]
+    def _insert_options(self, sizes: Mapping[str, int]) -> None:
+        """Put the job's options into the database, the file's after those that win over it. Local."""
+        if self.job.rtols:
+            self._insert({"ksp_rtol": f"{min(self.job.rtols):g}", "ksp_atol": "0"})
         self._insert(self.job.options)
         if self.job.options_file is not None:
             file = options.find_options_file(os.fspath(self.job.options_file))
-            header = options.read_header(file)
-            if not header.fits(sizes):
+            if not options.read_header(file).fits(sizes):
                 raise UsageError(f"{file.name} is not for the fields {', '.join(sizes)}")
             self._insert(options.parse(file))
-        return list(self.inserted)
 
-    def _insert(self, values: Any) -> None:
-        from petsc4py import PETSc
-
-        from petsc_fs import options
-
-        there = PETSc.Options().getAll()
-        self.inserted += [name for name in values if name not in there]
-        options.insert_all(values)
-
-    def _remove_options(self) -> None:
-        from petsc4py import PETSc
-
-        for name in self.inserted:
-            PETSc.Options().delValue(name)
-
-    def _set_up(self) -> tuple[Solver, float]:
-        """A solver, and the seconds until it is set up. Collective."""
-        from mpi4py import MPI
-
-        from petsc_fs.solver import Solver
-
-        self.comm.Barrier()
-        started = MPI.Wtime()
-        solver = Solver(self.scene, self.comm, layout=self.layout)
-        solver.set_up()
-        return solver, self._slowest(MPI.Wtime() - started)
-
-    def _warm_up(self) -> None:
-        """Set up and solve once, to the first tolerance. Collective."""
-        self.log.phase("set-up")
-        solver, _ = self._set_up()
-        try:
-            self.log.phase("solve")
-            set_tolerance(solver, self.rtols[0])
-            solver.solve()
-        finally:
-            solver.destroy()
+    def _insert(self, values: Mapping[str, str | None]) -> None:
+        self.inserted += options.insert_all(values)
 
     def _repeat(self, repetition: int) -> bool:
-        """Set up once and solve for each tolerance; whether all options were used. Collective."""
-        self.log.phase("set-up", repetition=repetition, rtol=self.rtols[0])
-        cpu = time.process_time()
-        solver, setup_seconds = self._set_up()
-        setup_cpu = self._slowest(time.process_time() - cpu)
-        monitor = Monitor(solver.ksp)
-        solved: list[tuple[int, FieldArrays | None]] = []
-        try:
-            for rtol in self.rtols:
+        """Set up and solve for each tolerance, step by step; whether all options were used. Collective.
+
+        Repetition -1 is a warm-up, without records.
+        """
+        self._forget()
+        steps, rtols = self.steps, self.rtols
+        if repetition < 0:
+            steps, rtols = steps[:WARM_UP_STEPS], rtols[:1]
+        sums: dict[float | None, Record] = {rtol: {} for rtol in rtols}
+        solved: list[tuple[int, Any]] = []
+        for k, (scene, layout, forcing) in enumerate(steps):
+            self.log.phase("set-up", repetition=max(repetition, 0), rtol=self.rtols[0])
+            solver, setup = self._timed(partial(self._set_up, scene, layout))
+            for rtol in rtols:
                 self.log.phase("solve", rtol=rtol)
-                set_tolerance(solver, rtol)
-                self.comm.Barrier()
-                cpu = time.process_time()
-                watch = monitor.listener = Stopwatch()
-                result = solver.solve()
-                cpu = self._slowest(time.process_time() - cpu)
-                monitor.listener = None
+                result, solve = self._timed(partial(solver.solve, forcing if rtol is None else rtol))
+                sums[rtol] = _worst(sums[rtol], self._describe(result, setup, solve))
+                if repetition < 0 or k + 1 < len(steps):
+                    continue
                 useless = self._useless()
-                number = self.log.record(
-                    {
-                        "kind": "unused_option" if useless else verdict(result),
-                        "message": useless,
-                        "iterations": result.iterations,
-                        "reason": result.reason,
-                        "limited_by_rounding": result.limited_by_rounding,
-                        "tolerance": result.tolerance,
-                        "read_seconds": self.read_seconds,
-                        "setup_seconds": setup_seconds,
-                        "solve_seconds": self._slowest(result.solve_seconds),
-                        "cpu_seconds": setup_cpu + cpu,
-                        "cpu_by_phase": {"read": self.read_cpu, "setup": setup_cpu, "solve": cpu},
-                        "true_residual": result.true_relative_residual,
-                        "residual_by_field": result.residual_by_field,
-                        "base_rss": self.base,
-                        "peak_rss": self.comm.allgather(peak()),
-                        "fallback": result.fallback,
-                        "direct": solver.ksp.getPC().getType() in ("lu", "cholesky"),
-                    }
-                )
+                what = {"kind": "unused_option", "message": useless} if useless else {}
+                number = self.log.record(sums[rtol] | what)
                 if useless:
                     return False
-                solved.append((number, solver.system.gather(result.solution)))
-            if self.job.errors or self.job.history:
-                self._compute_errors(solved)
-            if self.job.history and repetition == self.job.repetitions - 1:
-                self.log.phase("history")
-                self.log.write({"supplement": number, "history": self._history(solver, monitor, watch)})
-        finally:
-            solver.destroy()
+                if self.job.errors and not self.is_sequence:
+                    solved.append((number, solver.system.gather(result.solution)))
+        if solved:
+            self._compute_errors(solved)
         return True
 
-    def _slowest(self, seconds: float) -> float:
-        from mpi4py import MPI
+    def _set_up(self, scene: Scene, layout: Layout) -> Solver:
+        """A solver that is set up: the last step's, updated, where fields have the same sizes. Collective."""
+        from petsc_fs.solver import Solver
 
-        return float(self.comm.allreduce(seconds, op=MPI.MAX))
+        if self.solver is not None and _sizes(self.solver.layout) == _sizes(layout):
+            self.solver.update(replace(scene))
+        else:
+            self._forget()
+            self.solver = Solver(replace(scene), self.comm, layout=layout)
+        self.solver.set_up()
+        return self.solver
+
+    def _forget(self) -> None:
+        if self.solver is not None:
+            self.solver.destroy()
+            self.solver = None
+
+    def _describe(self, result: Result, setup: tuple[float, float], solve: tuple[float, float]) -> Record:
+        """The record of one solve. Collective."""
+        seconds = [
+            dict(zip(("read", "setup", "solve"), s, strict=True))
+            for s in zip(self.read_seconds, setup, solve, strict=True)
+        ]
+        return {
+            "kind": verdict(result),
+            "message": "" if result.converged else "; ".join(result.notes),
+            "iterations": result.iterations,
+            "reason": result.reason,
+            "tolerance": result.tolerance,
+            "seconds": seconds[0],
+            "cpu_seconds": seconds[1],
+            "true_residual": result.true_relative_residual,
+            "residual_by_field": result.residual_by_field,
+            "base_rss": self.base,
+            "peak_rss": self.comm.allgather(memory.peak()),
+        }
 
     def _useless(self) -> str:
-        """What to say of options of the job that nothing asked for, on any rank; "" if there are none. Collective."""
-        from petsc_fs import options
-
-        names = options.refused([name for name in options.unused() if name in self.given])
-        found = sorted(set().union(*self.comm.allgather(names)))
+        """What to say of options of the job that nothing on any rank asked for; "" if there are none. Collective."""
+        idle = set.intersection(*map(set, self.comm.allgather(options.unused())))
+        found = options.refused(sorted(idle & set(self.given)))
         if not found:
             return ""
         file = options.find_options_file(os.fspath(self.job.options_file)) if self.job.options_file else None
         return options.explain(found, self.job.options, file)
 
-    def _compute_errors(self, solved: list[tuple[int, FieldArrays | None]]) -> None:
+    def _compute_errors(self, solved: list[tuple[int, Any]]) -> None:
         """Forward and backward errors of solutions, each with the number of its record. Collective."""
         from petsc_fs.io import hdf5
 
@@ -291,98 +277,28 @@ class Probe:
                 if solution is not None and self.judge is not None:
                     self.log.write({"supplement": number, **self.judge.errors(solution)})
 
-    def _history(self, solver: Solver, monitor: Monitor, watch: Stopwatch) -> Record:
-        """Errors and residuals by iteration, from one more solve; times from the one that was watched. Collective."""
-        rows: list[Record] = []
-        system = solver.system
-        scale = system.b.norm() or 1.0
 
-        def look(ksp: Any, number: int) -> None:
-            if len(rows) >= len(watch.seconds) or number == 0 < len(rows):
-                return  # a restart repeats the last iterate
-            x = ksp.buildSolution()
-            r = x.duplicate()
-            system.J.mult(x, r)
-            r.aypx(-1.0, system.b)
-            by_field = {f: n / scale for f, n in system.field_norms(system.by_field(r)).items()}
-            whole = system.gather(system.by_field(x))
-            row = {"residual": float(np.linalg.norm(list(by_field.values()))), "residual_by_field": by_field}
-            if whole is not None and self.judge is not None:
-                row |= self.judge.errors(whole, backward=False)
-            rows.append(row)
-            r.destroy()
-
-        monitor.listener = look
-        solver.solve()
-        monitor.listener = None
-        table: Record = {"seconds": watch.seconds[: len(rows)], "cpu_seconds": watch.cpu_seconds[: len(rows)]}
-        table |= {"residual": [row["residual"] for row in rows]}
-        for name in ("residual_by_field", "error_by_field"):
-            if rows and rows[0].get(name):
-                table[name] = {f: [row[name][f] for row in rows] for f in rows[0][name]}
-        if rows and rows[0].get("forward_error") is not None:
-            table["forward_error"] = [row["forward_error"] for row in rows]
-        return table
-
-
-def set_tolerance(solver: Solver, rtol: float | None) -> None:
-    """Make the relative tolerance the only one, unless it is None."""
-    if rtol is not None:
-        solver.ksp.setTolerances(rtol=rtol, atol=0.0)
-        solver.rtol = solver.true_rtol = rtol
-
-
-class Monitor:
-    """Hands each iterate of a KSP to whoever listens."""
-
-    def __init__(self, ksp: Any) -> None:
-        """Join the monitors of the KSP, for as long as it lives."""
-        self.listener: Callable[[Any, int], None] | None = None
-        ksp.setMonitor(self._tell)
-
-    def _tell(self, ksp: Any, number: int, norm: float) -> None:
-        if self.listener is not None:
-            self.listener(ksp, number)
-
-
-class Stopwatch:
-    """When each iterate of a KSP came to be: seconds since now by the clock, and of this rank's processor."""
-
-    def __init__(self) -> None:
-        """Start."""
-        self.seconds: list[float] = []
-        self.cpu_seconds: list[float] = []
-        self._started, self._cpu = time.perf_counter(), time.process_time()
-
-    def __call__(self, ksp: Any, number: int) -> None:
-        """Note the time of an iterate; a restart repeats the last one."""
-        if number or not self.seconds:
-            self.seconds.append(time.perf_counter() - self._started)
-            self.cpu_seconds.append(time.process_time() - self._cpu)
+def _sizes(layout: Layout) -> dict[str, int]:
+    return {f: layout.sizes(f)[1] for f in layout.fields if layout.sizes(f)[1]}
 
 
 class Judge:
     """Computes the errors of solutions of one scene, on one rank."""
 
-    def __init__(self, scene: Scene, reference: str | os.PathLike[str] | None) -> None:
+    def __init__(self, scene: Scene, reference: Path_ | None) -> None:
         from petsc_fs.tools import reference as references
 
         self.scene = scene
-        self.ruler = None if reference is None else references.ruler(scene, references.read(reference))
+        self.ruler = None if reference is None else references.Ruler(scene, references.read(reference).solution)
 
-    def errors(self, solution: dict[str, Any], backward: bool = True) -> Record:
-        """Forward errors where there is a reference, and backward errors if asked for."""
-        from petsc_fs.tools.accuracy import backward_error, residual, row_magnitudes
-        from petsc_fs.tools.conditioning import fieldwise_backward_error
+    def errors(self, solution: Mapping[str, Any]) -> Record:
+        """Backward errors, and forward errors where there is a reference."""
+        from petsc_fs.tools.reference import backward_error
 
-        found: Record = {}
+        found: Record = {"backward_error": backward_error(self.scene, solution)}
         if self.ruler is not None:
-            errors = self.ruler.errors(solution)
-            found |= {"forward_error": errors.total, "error_by_field": errors.by_field}
-        if backward:
-            known = (solution, residual(self.scene, solution), row_magnitudes(self.scene, solution))
-            fieldwise = {"fieldwise": fieldwise_backward_error(self.scene, *known)}
-            found["backward_error"] = backward_error(self.scene, *known) | fieldwise
+            total, by_field = self.ruler.errors(solution)
+            found |= {"forward_error": total, "error_by_field": by_field}
         return found
 
 
@@ -392,6 +308,17 @@ def verdict(result: Result) -> str:
         return "converged"
     blown_up = result.reason in ("DIVERGED_DTOL", "DIVERGED_NANORINF") or not result.true_relative_residual <= 1.0
     return "diverged" if blown_up else "stagnated"
+
+
+def _worst(before: Record, now: Record) -> Record:
+    """Two steps as one: sums of iterations and seconds, else what is of the worse one."""
+    if not before:
+        return now
+    found = dict(max((before, now), key=lambda r: (r["kind"] != "converged", r["true_residual"])))
+    found["iterations"] = before["iterations"] + now["iterations"]
+    for clock in ("seconds", "cpu_seconds"):
+        found[clock] = now[clock] | {k: before[clock][k] + now[clock][k] for k in ("setup", "solve")}
+    return found | {"peak_rss": now["peak_rss"]}
 
 
 def _explain(error: Exception) -> Record:
@@ -406,27 +333,6 @@ def _explain(error: Exception) -> Record:
     else:
         kind = "failed"
     return {"kind": kind, "message": message or type(error).__name__}
-
-
-def resident() -> int:
-    """Bytes of this process in memory."""
-    return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * resource.getpagesize()
-
-
-def reset_peak() -> None:
-    """Let `peak` count from now on, where the system can do that."""
-    with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-
-
-def peak() -> int:
-    """Most bytes of this process that were ever in memory, or since `reset_peak`."""
-    with contextlib.suppress(OSError), open("/proc/self/status", encoding="ascii") as file:
-        for line in file:
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024
-    factor = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * factor
 
 
 if __name__ == "__main__":

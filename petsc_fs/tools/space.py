@@ -35,7 +35,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from petsc_fs import options
 from petsc_fs.errors import UsageError
@@ -57,52 +57,25 @@ EXTRAS = {
 GRID_POINTS = 3
 
 
-class Trial(Protocol):
-    """What `Space.suggest` asks of optuna's trial."""
-
-    def suggest_categorical(self, name: str, choices: Sequence[str]) -> Any:
-        """One of the choices."""
-
-    def suggest_int(self, name: str, low: int, high: int, *, step: int = 1) -> int:
-        """An integer."""
-
-    def suggest_float(
-        self, name: str, low: float, high: float, *, step: float | None = None, log: bool = False
-    ) -> float:
-        """A float."""
-
-
 @dataclass(frozen=True)
 class Parameter:
-    """One thing that may change.
+    """One thing that may change."""
 
-    Attributes:
-        name: GROUP.NAME.
-        option: the option it sets, by full name without the dash.
-        kind: one of `KINDS`.
-        choices: of a categorical one, by label: the options that each sets.
-        bounds: of a numeric one, both included.
-        step: between values of a numeric one.
-        points: values of a float one in a grid.
-        start: value in the first trial, None for whatever the sampler takes.
-        when: labels that other parameters must have for this one to exist.
-    """
-
-    name: str
-    option: str
-    kind: str
-    choices: Mapping[str, Changes]
-    bounds: tuple[float, float]
-    step: float | None
-    points: int
-    start: Value | None
-    when: Mapping[str, tuple[str, ...]]
+    name: str  # GROUP.NAME
+    option: str  # that it sets, by full name without the dash
+    kind: str  # of KINDS
+    choices: Mapping[str, Changes]  # of a categorical one, by label: the options that each sets
+    bounds: tuple[float, float]  # of a numeric one, both included
+    step: float | None  # between values of a numeric one
+    points: int  # values of a float one in a grid
+    start: Value | None  # in the first trial; None for whatever the sampler takes
+    when: Mapping[str, tuple[str, ...]]  # labels that other parameters must have for this one to exist
 
     def active(self, values: Mapping[str, Value]) -> bool:
         """Whether the parameter exists where those before it have these values."""
         return all(name in values and label(values[name]) in allowed for name, allowed in self.when.items())
 
-    def suggest(self, trial: Trial) -> Value:
+    def suggest(self, trial: Any) -> Value:
         """The value that a sampler takes."""
         low, high = self.bounds
         if self.kind == "choices":
@@ -134,21 +107,14 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Space:
-    """A base options file and the parameters that change it.
+    """A base options file and the parameters that change it."""
 
-    Attributes:
-        path: of the space's file.
-        description: one line.
-        base: options file.
-        parameters: a parameter comes after those that its `when` names.
-    """
+    path: Path  # of the space's file
+    description: str  # one line
+    base: Path  # options file
+    parameters: tuple[Parameter, ...]  # each after those that its `when` names
 
-    path: Path
-    description: str
-    base: Path
-    parameters: tuple[Parameter, ...]
-
-    def suggest(self, trial: Trial) -> dict[str, Value]:
+    def suggest(self, trial: Any) -> dict[str, Value]:
         """The values that a sampler takes for all parameters that exist together."""
         values: dict[str, Value] = {}
         for parameter in self.parameters:

@@ -2,12 +2,17 @@
 
 Solves run in processes apart (see `petsc_fs.tools.measure`), with the tolerances that their options files have.
 What it hands on as converged is held against a reference solution (`petsc_fs.tools.reference`) field by field.
+
+A residual of each field of at most tol (|J| |x| + |b|) in its rows bounds the field's error by √fields κ tol. The
+Krylov method sees to the residual of all fields together, so that a small field may miss this bound, and κ is estimated
+from below: hence the factor `SAFETY`.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import tempfile
 import time
@@ -23,11 +28,9 @@ from petsc_fs import options
 from petsc_fs.errors import SolveError, UsageError
 from petsc_fs.io import hdf5
 from petsc_fs.io.files import write_text
-from petsc_fs.tools.compare import split_petsc
-from petsc_fs.tools.measure import Job, Record, measure
-from petsc_fs.tools.stress_cases import StressCase, catalogue
-from petsc_fs.tools.stress_held_out import held_out
-from petsc_fs.tools.stress_repairs import REPAIRED, variants
+from petsc_fs.tools.measure import Job, Record, Variant, measure_all, seconds_of, split_ranks
+from petsc_fs.tools.pages import markdown
+from petsc_fs.tools.stress_cases import StressCase, catalogue, held_out
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -55,42 +58,26 @@ OUTCOMES = {
 }
 """What can come of a solve."""
 
-SMALLEST = "(smallest tree)"
-"""In place of an options file: the solver that `petsc-fs solve` cuts for the scene."""
-SCALED = "(smallest tree, scaled)"
-"""The same with -petsc_fs_scaling always."""
+DEFAULT = "(default)"
+"""In place of an options file: what `petsc-fs solve` takes for the scene."""
+RETRY = "(default, retry)"
+"""The same with -petsc_fs_retry retry.opts."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What is known of a case before anything is solved.
-
-    Attributes:
-        name: of the case.
-        group: heading.
-        hard: what makes it hard.
-        source: where it comes from.
-        fields: of the scene.
-        unknowns: number of them.
-        path: of the scene.
-        reference: file of the reference solution; "" if there is none.
-        no_reference: why.
-        conditions: see `petsc_fs.tools.conditioning.field_conditions`.
-        singular: whether the catalogue says so.
-        solvable: whether there is a solution.
-        held_out: whether the case is held out, see `petsc_fs.tools.stress_held_out`.
-    """
+    """What is known of a case before anything is solved; see `petsc_fs.tools.stress_cases.StressCase` for the rest."""
 
     name: str
     group: str
     hard: str
     source: str
-    fields: tuple[str, ...]
-    unknowns: int
-    path: str
-    reference: str
-    no_reference: str
-    conditions: dict[str, float]
+    fields: tuple[str, ...]  # of the scene
+    unknowns: int  # number of them
+    path: str  # of the scene
+    reference: str  # file of the reference solution; "" if there is none
+    no_reference: str  # why
+    conditions: dict[str, float]  # see `petsc_fs.tools.reference.field_conditions`
     singular: bool
     solvable: bool = True
     held_out: bool = False
@@ -98,49 +85,28 @@ class Truth:
 
 @dataclass(frozen=True)
 class Finding:
-    """What came of one case with one options file on some ranks.
+    """What came of one case with one options file on some ranks."""
 
-    Attributes:
-        case: its name.
-        file: name of the options file, or `SMALLEST` or `SCALED`, with further options behind it.
-        ranks: number of them.
-        outcome: one of `OUTCOMES`.
-        kind: of `petsc_fs.tools.measure.KINDS`.
-        message: what was said.
-        iterations: of the outer Krylov method.
-        reason: why it stopped.
-        fallback: rung of -petsc_fs_fallback that found the solution; "" if none did.
-        true_residual: relative, in the norm that the solver judges by.
-        tolerance: what the solver held it against, `TOLERANCE` at least.
-        error_by_field: relative, in natural norms.
-        allowed_by_field: the largest errors that count as right.
-        backward_error: normwise, componentwise and fieldwise.
-        seconds: set-up and solve.
-    """
-
-    case: str
-    file: str
+    case: str  # its name
+    file: str  # name of the options file, or DEFAULT or RETRY
     ranks: int
-    outcome: str
-    kind: str
-    message: str
-    iterations: int | None
-    reason: str | None
-    fallback: str
-    true_residual: float | None
-    tolerance: float
-    error_by_field: dict[str, float] | None
-    allowed_by_field: dict[str, float]
-    backward_error: dict[str, float] | None
-    seconds: float | None
+    outcome: str  # one of OUTCOMES
+    kind: str  # of `petsc_fs.tools.measure.KINDS`
+    message: str  # what was said
+    iterations: int | None  # of the outer Krylov method
+    reason: str | None  # why it stopped
+    error_by_field: dict[str, float] | None  # relative, in natural norms
+    backward_error: dict[str, float] | None  # normwise, componentwise and fieldwise
+    allowed_by_field: dict[str, float]  # the largest errors that count as right
+    seconds: float | None  # set-up and solve
 
 
-def prepare(cases: Iterable[StressCase], folder: Path, say: Callable[[str], None]) -> list[Truth]:
+def prepare(cases: Iterable[StressCase], folder: Path) -> list[Truth]:
     """Write the scenes, with reference solutions and condition numbers. Initialises PETSc; on one rank."""
     import petsc4py
 
     petsc4py.init(["petsc-fs"])
-    from petsc_fs.tools import conditioning, reference
+    from petsc_fs.tools import reference
 
     found = []
     for case in cases:
@@ -152,96 +118,58 @@ def prepare(cases: Iterable[StressCase], folder: Path, say: Callable[[str], None
                 exact = reference.solve(scene, "direct")
                 target = os.fspath(folder / f"{case.name}.npz")
                 reference.write(exact, target)
-                conditions = conditioning.field_conditions(scene, exact.solution)
+                conditions = reference.field_conditions(scene, exact.solution)
         except (SolveError, FloatingPointError) as e:
             why = str(e)
-        found.append(
-            Truth(
-                name=case.name,
-                group=case.group,
-                hard=case.hard,
-                source=case.source,
-                fields=scene.fields,
-                unknowns=sum(scene.sizes.values()),
-                path=os.fspath(path),
-                reference="" if case.singular else target,
-                no_reference=why,
-                conditions=conditions,
-                singular=case.singular,
-                solvable=case.solvable,
-                held_out=case.held_out,
-            )
-        )
-    say(f"{len(found)} scenes, {sum(bool(t.reference) for t in found)} with a reference solution")
+        same: dict[str, Any] = {
+            name: getattr(case, name) for name in "name group hard source singular solvable held_out".split()
+        }
+        known: dict[str, Any] = {"fields": scene.fields, "unknowns": sum(scene.sizes.values()), "path": os.fspath(path)}
+        target = "" if case.singular else target
+        found.append(Truth(**same, **known, reference=target, no_reference=why, conditions=conditions))
     return found
 
 
-def files_for(truth: Truth, names: Sequence[str] | None = None) -> list[str]:
-    """What a case is solved by: options files for its fields, and the smallest tree."""
-    fitting = [f.path.name for f in options.shipped() if f.fits(truth.fields)]
-    everything = [SMALLEST, SCALED, *fitting]
-    return everything if names is None else [n for n in everything if n in names]
+def variants(more: Mapping[str, str | None]) -> list[Variant]:
+    """All that can be tried: the default, with and without a second attempt, and every shipped file."""
+    retried = {"petsc_fs_retry": "retry.opts", **more}
+    files = [Variant(f.path.name, str(f.path), more, f.fields) for f in options.shipped()]
+    return [Variant(DEFAULT, options=more), Variant(RETRY, options=retried), *files]
 
 
 def run(
     truths: Sequence[Truth],
-    ranks: int,
+    chosen: Sequence[Variant],
     *,
-    names: Sequence[str] | None = None,
-    more: Mapping[str, str | None] | None = None,
-    label: str = "",
+    ranks: Sequence[int] = (1,),
     time_limit: float = 60.0,
     mpiexec: str | None = None,
     say: Callable[[str], None] = lambda line: None,
 ) -> Iterator[Finding]:
-    """Solve every case by every file that fits, one process at a time.
+    """Solve every case by every variant that fits, on every number of ranks, one process at a time.
 
     A process goes on from scene to scene; after one that ended by an error another process takes the rest.
-
-    Args:
-        truths: from `prepare`.
-        ranks: of each process.
-        names: options files to use; None for all that fit.
-        more: PETSc options, which win over the files.
-        label: what these are called behind the name of the file.
-        time_limit: seconds without a sign of life after which a solve counts as hanging.
-        mpiexec: program that starts ranks.
-        say: called with a line per options file.
     """
-    wanted = dict.fromkeys(file for truth in truths for file in files_for(truth, names))
-    for file in wanted:
-        left = [truth for truth in truths if file in files_for(truth, names)]
-        counts: Counter[str] = Counter()
-        started = time.perf_counter()
-        while left:
-            job = Job(
-                scenes=[t.path for t in left],
-                options_file=None if file in (SMALLEST, SCALED) else file,
-                options={**({"petsc_fs_scaling": "always"} if file == SCALED else {}), **(more or {})},
-                ranks=ranks,
-                errors=True,
-                references={t.path: t.reference for t in left if t.reference},
-                time_limit=time_limit,
-                keep_going=True,
-            )
-            records = measure(job, mpiexec=mpiexec)
-            by_path = {t.path: t for t in left}
-            for record in records:
-                finding = judge(by_path[record["scene"]], file + label, ranks, record)
-                counts[finding.outcome] += 1
-                yield finding
-            done = {record["scene"] for record in records}
-            left = [t for t in left if t.path not in done]
-        words = ", ".join(f"{n} {outcome}" for outcome, n in counts.items())
-        where = f"{ranks} rank{'s' if ranks > 1 else ''}"
-        say(f"{file}{label} on {where}: {words}; {time.perf_counter() - started:.0f} s")
+    by_path = {t.path: t for t in truths}
+    references = {t.path: t.reference for t in truths if t.reference}
+    job = Job(errors=True, references=references, time_limit=time_limit, keep_going=True)
+
+    def fits(system: str, variant: Variant) -> bool:
+        return variant.fits(by_path[system].fields)
+
+    processes = measure_all(list(by_path), chosen, job, ranks=ranks, fits=fits, batch=True, mpiexec=mpiexec)
+    for records in processes:
+        found = [judge(by_path[record["scene"]], record) for record in records]
+        numbers = Counter(f.outcome for f in found)
+        words = ", ".join(f"{n} {outcome}" for outcome, n in numbers.items())
+        say(f"{found[0].file} on {found[0].ranks} rank{'s' if found[0].ranks > 1 else ''}: {words}")
+        yield from found
 
 
-def judge(truth: Truth, file: str, ranks: int, record: Record) -> Finding:
-    """What a record of `petsc_fs.tools.measure` amounts to."""
-    tolerance = max(record["tolerance"] or 0.0, TOLERANCE)
+def judge(truth: Truth, record: Record) -> Finding:
+    """What a record of `petsc_fs.tools.measure.measure_all` amounts to."""
     allowed = {f: UNCONDITIONED for f in truth.fields}
-    allowed |= {f: min(WORST, SAFETY * tolerance * max(c, 1.0)) for f, c in truth.conditions.items()}
+    allowed |= {f: min(WORST, SAFETY * TOLERANCE * max(c, 1.0)) for f, c in truth.conditions.items()}
     errors, kind = record["error_by_field"], record["kind"]
     if kind in ("hang", "crash"):
         outcome = kind
@@ -254,50 +182,30 @@ def judge(truth: Truth, file: str, ranks: int, record: Record) -> Finding:
     else:
         backward = (record["backward_error"] or {}).get("fieldwise", np.inf)
         outcome = "right" if backward <= SINGULAR_BACKWARD else "wrong"
-    seconds = [record[key] for key in ("setup_seconds", "solve_seconds")]
-    return Finding(
-        case=truth.name,
-        file=file,
-        ranks=ranks,
-        outcome=outcome,
-        kind=kind,
-        message=record["message"],
-        iterations=record["iterations"],
-        reason=record["reason"],
-        fallback=record["fallback"] or "",
-        true_residual=record["true_residual"],
-        tolerance=tolerance,
-        error_by_field=errors,
-        allowed_by_field=allowed,
-        backward_error=record["backward_error"],
-        seconds=None if None in seconds else float(sum(seconds)),
-    )
+    said = {key: record[key] for key in "ranks kind message iterations reason error_by_field backward_error".split()}
+    seconds = None if record["seconds"] is None else seconds_of(record)["total"]
+    return Finding(truth.name, record["variant"], outcome=outcome, allowed_by_field=allowed, seconds=seconds, **said)
 
 
-def report(
-    truths: Sequence[Truth], findings: Sequence[Finding], command: str, repairs: Sequence[Finding] = ()
-) -> dict[str, Any]:
+def report(truths: Sequence[Truth], findings: Sequence[Finding], command: str) -> dict[str, Any]:
     """Everything, for JSON."""
     cases = [{k: v for k, v in asdict(t).items() if k not in ("path", "reference")} for t in truths]
-    found = {"command": command, "cases": cases, "findings": [asdict(f) for f in findings]}
-    return found | {"repairs": [asdict(f) for f in repairs], "counts": counts(found)}
+    return _counted({"command": command, "cases": cases, "findings": [asdict(f) for f in findings]})
 
 
-def counts(found: Mapping[str, Any]) -> dict[str, dict[str, int]]:
-    """Number of each outcome by number of ranks."""
+def _counted(found: dict[str, Any]) -> dict[str, Any]:
+    """With the number of each outcome by number of ranks."""
     numbers = sorted({f["ranks"] for f in found["findings"]})
-    return {str(n): dict(Counter(f["outcome"] for f in found["findings"] if f["ranks"] == n)) for n in numbers}
+    counts = {str(n): dict(Counter(f["outcome"] for f in found["findings"] if f["ranks"] == n)) for n in numbers}
+    return found | {"counts": counts}
 
 
 def merge(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Several reports as one; where two have the same case, file and ranks, the later one counts."""
     cases = {case["name"]: case for part in parts for case in part["cases"]}
-    found: dict[str, Any] = {"command": "; ".join(dict.fromkeys(p["command"] for p in parts))}
-    found["cases"] = list(cases.values())
-    for which in ("findings", "repairs"):
-        latest = {(f["file"], f["ranks"], f["case"]): f for part in parts for f in part.get(which, ())}
-        found[which] = list(latest.values())
-    return found | {"counts": counts(found)}
+    latest = {(f["file"], f["ranks"], f["case"]): f for part in parts for f in part["findings"]}
+    command = "; ".join(dict.fromkeys(p["command"] for p in parts))
+    return _counted({"command": command, "cases": list(cases.values()), "findings": list(latest.values())})
 
 
 def read_report(path: Path) -> dict[str, Any]:
@@ -315,38 +223,113 @@ def read_report(path: Path) -> dict[str, Any]:
     return found
 
 
+# --- the page
+
+
+def write_page(found: Mapping[str, Any], target: Path) -> list[Path]:
+    """Write a page in Markdown, and beside it the picture that it shows: cases by files, coloured by outcome.
+
+    Args:
+        found: what `report` gives.
+        target: page; the picture is called like it.
+
+    Returns:
+        Both files.
+
+    Raises:
+        UsageError: matplotlib is missing, or a file cannot be written.
+    """
+    from petsc_fs.tools.plots import plot_matrix
+
+    picture = plot_matrix(found["cases"], found["findings"], list(OUTCOMES), target.with_suffix(".png"))
+    held = {case["name"] for case in found["cases"] if case["held_out"]}
+    lines = [
+        "# Extreme scenes",
+        "",
+        f"Written by `{found['command']}`. Every case is solved with the tolerances of the options files; what",
+        "is handed on as converged is held against a reference solution. Thresholds were chosen on the catalogue; the",
+        "held-out cases were drawn at random after that.",
+        "",
+        *(f"- **{name}**: {words}" for name, words in OUTCOMES.items()),
+        "",
+        f"![Outcome of each case with each options file]({picture.name})",
+        "",
+    ]
+    for title, mine in (
+        ("Catalogue", [f for f in found["findings"] if f["case"] not in held]),
+        ("Held out", [f for f in found["findings"] if f["case"] in held]),
+    ):
+        if mine:
+            lines += [f"## {title}: {len({f['case'] for f in mine})} cases", "", *markdown(*_by_file(mine)), ""]
+    lines += ["## Cases", "", *markdown(*_cases(found)), ""]
+    lines += [f"Condition: of the worst field. Iterations and error: of {DEFAULT}."]
+    write_text(target, "\n".join(lines) + "\n")
+    return [target, picture]
+
+
+def _by_file(findings: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[object]]]:
+    """Outcomes by file and ranks, with iterations of what was right and the names of what was not."""
+    groups: dict[tuple[str, int], list[Mapping[str, Any]]] = {}
+    for f in findings:
+        groups.setdefault((f["file"], f["ranks"]), []).append(f)
+    rows: list[list[object]] = []
+    for (file, n), mine in groups.items():
+        numbers = Counter(f["outcome"] for f in mine)
+        iterations = sum(f["iterations"] or 0 for f in mine if f["outcome"] == "right")
+        bad = ", ".join(f["case"] for f in mine if f["outcome"] != "right") or "–"
+        rows.append([file, n, *(numbers[o] for o in OUTCOMES), iterations, bad])
+    return ["file", "ranks", *OUTCOMES, "iterations", "does not solve"], rows
+
+
+def _cases(found: Mapping[str, Any]) -> tuple[list[str], list[list[object]]]:
+    """The catalogue, with what the default makes of it."""
+    best = {f["case"]: f for f in reversed(found["findings"]) if f["file"] == DEFAULT}
+    rows: list[list[object]] = []
+    for case in found["cases"]:
+        known = [c for c in case["conditions"].values() if math.isfinite(c)]
+        condition = "singular" if case["singular"] else f"{max(known):.0e}" if known else "not known"
+        end: tuple[object, str] = ("", "")
+        if case["name"] in best:
+            f = best[case["name"]]
+            right = f["outcome"] == "right"
+            error = f"{max(f['error_by_field'].values()):.0e}" if right and f["error_by_field"] else ""
+            end = (f["iterations"] if right else f["outcome"], error)
+        rows.append([case["name"], case["unknowns"], case["hard"], case["source"], condition, *end])
+    return ["case", "unknowns", "what makes it hard", "from", "condition", "iterations", "worst error"], rows
+
+
+# --- the command line
+
+SUITES = ("quick", "full", "held-out")
+EPILOG = """\
+-n RANKS says on how many ranks; other PETSc options win over those of the options files. The full suite has the
+held-out cases, too. Exit code 1 if an answer was wrong, a solve hung or a process crashed; refusals are honest and
+count as none of these."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `petsc-fs stress`."""
     parser.epilog = EPILOG
     parser.add_argument("--suite", choices=SUITES, default="quick", help="default %(default)s")
     parser.add_argument("--ranks", type=int, nargs="+", metavar="N", help="numbers of ranks, as -n; default 1")
     parser.add_argument("--only", nargs="+", metavar="CASE", help="these cases instead of a suite")
-    parser.add_argument("--files", nargs="+", metavar="FILE", help="these options files only")
-    parser.add_argument("--repairs", action="store_true", help="each repair without and with it, too")
+    parser.add_argument("--files", nargs="+", metavar="FILE", help=f"these options files only; also {DEFAULT}, {RETRY}")
     parser.add_argument("--list", action="store_true", help="print the catalogue and end")
     parser.add_argument("--report", type=Path, metavar="FILE.json", help="write everything that was found")
     parser.add_argument("--read", type=Path, nargs="+", metavar="FILE.json", help="read reports instead of solving")
     parser.add_argument("--page", type=Path, metavar="FILE.md", help="write it as a page, with a picture beside it")
-    parser.add_argument("--limits", type=Path, metavar="FILE.md", help="write where each options file can be trusted")
     parser.add_argument("--time-limit", type=float, default=60.0, metavar="S", help="of one solve; default %(default)s")
     parser.add_argument("--mpiexec", metavar="PROGRAM", help="that starts ranks")
-
-
-SUITES = ("quick", "full", "held-out")
-EPILOG = """\
--n RANKS says on how many ranks; other PETSc options win over those of the options files. The full suite has the
-held-out cases, too. Exit code 1 if an answer was wrong, a solve hung or a process crashed; refusals are honest and
-count as none of these, and so does what comes of solvers without their repairs."""
 
 
 def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
     """Run `petsc-fs stress`."""
     if comm.size > 1:
         raise UsageError("stress starts mpiexec itself: call it without, and give it -n RANKS")
-    from petsc_fs.cli.main import check_folders
+    from petsc_fs.io.bundled import check_targets
 
-    check_folders(args.report, args.page, args.limits)
-    numbers, more = split_petsc(petsc)
+    check_targets(args.report, args.page)
+    numbers, more = split_ranks(petsc)
     cases = _chosen(args)
     if args.list:
         for case in cases:
@@ -356,44 +339,30 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
     if args.read:
         found = merge([read_report(path) for path in args.read])
     else:
-        found = _solve(args, cases, sorted({*(args.ranks or ()), *numbers}) or [1], more)
+        ranks = sorted({*(args.ranks or ()), *numbers}) or [1]
+        known = {v.label: v for v in variants(more)}
+        for name in args.files or ():
+            if name not in known:
+                raise UsageError(f"no options file {name!r}; there are {', '.join(known)}")
+        with tempfile.TemporaryDirectory(prefix="petsc_fs-stress-") as folder:
+            truths = prepare(cases, Path(folder))
+            _say(f"{len(truths)} scenes, {sum(bool(t.reference) for t in truths)} with a reference solution")
+            how: dict[str, Any] = {"time_limit": args.time_limit, "mpiexec": args.mpiexec, "say": _say}
+            findings = list(run(truths, [known[n] for n in args.files or known], ranks=ranks, **how))
+        words = f"--only {' '.join(args.only)}" if args.only else f"--suite {args.suite}"
+        found = report(truths, findings, f"petsc-fs stress {words} --ranks {' '.join(map(str, ranks))}")
     if args.report is not None:
         write_text(args.report, json.dumps(found, indent=1) + "\n")
     if args.page is not None:
-        from petsc_fs.tools.stress_page import write_page
-
         write_page(found, args.page)
-    if args.limits is not None:
-        from petsc_fs.tools.stress_limits import write_limits
-
-        write_limits(found, args.limits)
     bad = [f for f in found["findings"] if f["outcome"] not in ("right", "refusal")]
     for finding in bad:
-        print(f"{finding['outcome'].upper()}: {describe(Finding(**finding))}")
-    for n, numbers_of in found["counts"].items():
-        print(f"{n} rank{'s' if n != '1' else ''}: " + ", ".join(f"{numbers_of.get(o, 0)} {o}" for o in OUTCOMES))
-    solves = len(found["findings"]) + len(found["repairs"])
-    print(f"{len(found['cases'])} cases, {solves} solves, {time.perf_counter() - started:.0f} s")
+        _say(f"{finding['outcome'].upper()}: {describe(Finding(**finding))}")
+    for n, counts in found["counts"].items():
+        _say(f"{n} rank{'s' if n != '1' else ''}: " + ", ".join(f"{counts.get(o, 0)} {o}" for o in OUTCOMES))
+    seconds = time.perf_counter() - started
+    _say(f"{len(found['cases'])} cases, {len(found['findings'])} solves, {seconds:.0f} s")
     return 1 if bad else 0
-
-
-def _solve(
-    args: argparse.Namespace, cases: Sequence[StressCase], ranks: Sequence[int], more: Mapping[str, str | None]
-) -> dict[str, Any]:
-    """Run the chosen cases; a report."""
-    findings: list[Finding] = []
-    repaired: list[Finding] = []
-    common: dict[str, Any] = {"time_limit": args.time_limit, "mpiexec": args.mpiexec, "say": _say}
-    with tempfile.TemporaryDirectory(prefix="petsc_fs-stress-") as folder:
-        truths = prepare(cases, Path(folder), _say)
-        for n in ranks:
-            findings += run(truths, n, names=args.files, more=more, **common)
-        if args.repairs:
-            for label, values in variants().items():
-                repaired += run(truths, ranks[0], names=[REPAIRED], more={**values, **more}, label=label, **common)
-    words = f"--only {' '.join(args.only)}" if args.only else f"--suite {args.suite}"
-    words += f" --ranks {' '.join(map(str, ranks))}" + (" --repairs" if args.repairs else "")
-    return report(truths, findings, f"petsc-fs stress {words}", repaired)
 
 
 def describe(finding: Finding) -> str:
@@ -410,17 +379,13 @@ def _chosen(args: argparse.Namespace) -> list[StressCase]:
     """The cases of a call.
 
     Raises:
-        UsageError: there is no such case or file.
+        UsageError: there is no such case.
     """
     known = {case.name: case for case in [*catalogue(), *held_out()]}
     for name in args.only or ():
         if name not in known:
             similar = options.closest(name, known)
             raise UsageError(f"no case {name!r}" + (f"; did you mean {' or '.join(similar)}?" if similar else ""))
-    files = [SMALLEST, SCALED, *(f.path.name for f in options.shipped())]
-    for name in args.files or ():
-        if name not in files:
-            raise UsageError(f"no options file {name!r}; there are {', '.join(files)}")
     if args.only:
         return [known[name] for name in args.only]
     if args.suite == "held-out":

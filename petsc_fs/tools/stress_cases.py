@@ -2,12 +2,17 @@
 
 Two kinds of scenes: those that PorePy exports by a `Recipe` (bundled in one file, `COLLECTION`, and made anew by
 `scripts/stress_scenes`), and those that a function here makes of another one. A case names the one or the other.
+
+Some cases are held out: drawn at random, by number, after all thresholds had been chosen on the others, so that nobody
+has picked them, and none is left out. Models with random parameters, all at once, around random fractures; and scenes
+under random transformations.
 """
 
 from __future__ import annotations
 
-import io
+import json
 import lzma
+import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
@@ -20,20 +25,21 @@ from numpy.typing import NDArray
 from petsc_fs.errors import SceneError
 from petsc_fs.io import hdf5
 from petsc_fs.scene import CSR, Scene
+from petsc_fs.tools.reference import rows_of
 
 COLLECTION = Path(__file__).resolve().parent.parent / "scenes" / "stress" / "scenes.h5.xz"
 """Compressed HDF5 file of the exported scenes: a group for each, equal arrays stored once."""
 HELD_OUT_COLLECTION = COLLECTION.with_name("held_out.h5.xz")
-"""The same for the recipes of `petsc_fs.tools.stress_held_out`."""
+"""The same for the recipes of `HELD_OUT`."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Recipe:
     """A linear system of a PorePy model with changed parameters.
 
     Attributes:
-        hard: what makes it hard, in a line.
         group: heading under which it is listed.
+        hard: what makes it hard, in a line.
         model: name in `petsc_fs.porepy.cases.CASES`.
         refinement: cells are 100 m / refinement wide.
         step: time step, from 1, and Newton step, from 0; the last one before it where Newton's method ends earlier.
@@ -43,8 +49,8 @@ class Recipe:
         twist: changes that no parameter makes, see `petsc_fs.porepy.stress_export`.
     """
 
-    hard: str
     group: str
+    hard: str
     model: str = "model2"
     refinement: float = 0.3
     step: tuple[int, int] = (1, 1)
@@ -54,273 +60,36 @@ class Recipe:
     twist: Mapping[str, Any] = field(default_factory=dict)
 
 
-def lame(ratio: float, shear_modulus: float = 1.2e10) -> dict[str, float]:
-    """Lamé coefficients for a Poisson's ratio and a shear modulus, by default the model's."""
-    return {"shear_modulus": shear_modulus, "lame_lambda": 2 * shear_modulus * ratio / (1 - 2 * ratio)}
+CONTACT, FLOW, UNITS, ALGEBRA, HELD = "contact", "flow", "units", "algebra", "held out"
 
 
-def _stiffness(factor: float) -> dict[str, float]:
-    return {"shear_modulus": 1.2e10 * factor, "lame_lambda": 1.2e10 * factor}
+def _frozen(value: Any) -> Any:
+    return tuple(map(_frozen, value)) if isinstance(value, list) else value
 
 
-def opening(width: float) -> dict[str, float]:
-    """Rock data for fractures of a width in m."""
-    return {"residual_aperture": width, "fracture_gap": width, "maximum_elastic_fracture_opening": width / 2}
+def _read_recipes() -> dict[str, Recipe]:
+    text = COLLECTION.with_name("recipes.json").read_text(encoding="utf-8")
+    frozen = json.loads(text, object_hook=lambda found: {k: _frozen(v) for k, v in found.items()})
+    return {name: Recipe(**known) for name, known in frozen.items()}
 
 
-def _crosses(number: int) -> tuple[tuple[float, float, float, float], ...]:
-    """Fractures along lines of a 10 by 10 grid that cross each other two by two."""
-    found = []
-    for k in range(number // 2):
-        x, y = 0.1 + 0.2 * (k % 5), 0.2 + 0.3 * (k // 5)
-        found += [(max(x - 0.1, 0.0), y, x + 0.1, y), (x, y - 0.1, x, y + 0.1)]
-    return tuple(tuple(round(v, 1) for v in line) for line in found)  # type: ignore[misc]
-
-
-CONTACT, FLOW, ROCK, TIME, SHAPE, UNITS, ALGEBRA = (
-    "contact", "flow", "rock and coupling", "time", "geometry", "units", "algebra",
-)  # fmt: skip
-
-RECIPES: dict[str, Recipe] = {
-    "base": Recipe(group=CONTACT, hard="nothing: the second Newton step of model 2, which the others vary"),
-    "friction_0": Recipe(
-        group=CONTACT, hard="no friction: tangential rows lose all traction of their own", parameters={"friction": 0.0}
-    ),
-    "friction_0.01": Recipe(
-        group=CONTACT, hard="tangential rows nearly without traction", parameters={"friction": 0.01}
-    ),
-    "friction_0.1": Recipe(group=CONTACT, hard="most cells slide", parameters={"friction": 0.1}),
-    "friction_0.8": Recipe(
-        group=CONTACT, hard="high friction couples normal and tangential", parameters={"friction": 0.8}
-    ),
-    "friction_1.5": Recipe(
-        group=CONTACT,
-        hard="friction above 1: the tangential rows are dominated by normal traction",
-        parameters={"friction": 1.5},
-    ),
-    "kn_0": Recipe(
-        group=CONTACT, hard="rigid fracture walls: no elastic opening", parameters={"normal_stiffness": 0.0}
-    ),
-    "kn_1.2e5": Recipe(group=CONTACT, hard="walls 1e4 times softer", parameters={"normal_stiffness": 1.2e5}),
-    "kn_1.2e12": Recipe(group=CONTACT, hard="walls 1e3 times stiffer", parameters={"normal_stiffness": 1.2e12}),
-    "kn_1.2e16": Recipe(group=CONTACT, hard="walls 1e7 times stiffer", parameters={"normal_stiffness": 1.2e16}),
-    "kn_1.2e20": Recipe(group=CONTACT, hard="walls 1e11 times stiffer", parameters={"normal_stiffness": 1.2e20}),
-    "first_step": Recipe(group=CONTACT, step=(1, 0), hard="first Newton step: traction and jump are zero everywhere"),
-    "flip_2": Recipe(group=CONTACT, step=(1, 2), hard="states flipped since the Newton step before"),
-    "flip_3": Recipe(group=CONTACT, step=(2, 1), hard="second time step, second Newton step: states flipped once more"),
-    "sticking": Recipe(
-        group=CONTACT,
-        hard="all cells stick: the contact block is singular everywhere",
-        parameters={"friction": 100.0},
-        case={"traction": 3e7},
-    ),
-    "sliding": Recipe(
-        group=CONTACT, hard="all cells slide", parameters={"friction": 1e-4}, case={"traction": 3e6, "shear": 3e6}
-    ),
-    "open": Recipe(
-        group=CONTACT,
-        hard="all cells open: fractures carry no traction",
-        case={"traction": -3e7, "pressure_ratio": 1.0},
-    ),
-    "contact_constant_1e-6": Recipe(
-        group=CONTACT, hard="constant c of the contact conditions 1e6 times smaller", twist={"contact_constant": 1e-6}
-    ),
-    "contact_constant_1e6": Recipe(group=CONTACT, hard="constant c 1e6 times larger", twist={"contact_constant": 1e6}),
-    "characteristic_displacement_1e-7": Recipe(
-        group=CONTACT,
-        hard="traction scaled 1e6 times smaller: its unknowns are 1e6 times larger",
-        rock={"characteristic_displacement": 1e-7},
-    ),
-    "characteristic_displacement_1e5": Recipe(
-        group=CONTACT,
-        step=(1, 0),
-        hard="traction scaled 1e6 times larger: its unknowns are 1e6 times smaller",
-        rock={"characteristic_displacement": 1e5},
-    ),
-    "permeability_1e-22": Recipe(
-        group=FLOW,
-        model="model1",
-        hard="rock all but impermeable: contrast to fractures 1e22",
-        rock={"permeability": 1e-22},
-    ),
-    "permeability_1e-18": Recipe(
-        group=FLOW, model="model1", hard="contrast of rock and fractures 1e18", rock={"permeability": 1e-18}
-    ),
-    "permeability_1e-8": Recipe(
-        group=FLOW, model="model1", hard="rock like gravel: flow dominates storage", rock={"permeability": 1e-8}
-    ),
-    "uniform_permeability": Recipe(
-        group=FLOW,
-        model="model1",
-        hard="fractures no better than rock",
-        parameters={"fracture_permeability": "constant"},
-    ),
-    "cubic_law": Recipe(
-        group=FLOW,
-        model="model1",
-        hard="fracture permeability follows the opening",
-        parameters={"fracture_permeability": "cubic"},
-    ),
-    "normal_permeability_1e-18": Recipe(
-        group=FLOW, model="model1", hard="fracture walls all but tight", rock={"normal_permeability": 1e-18}
-    ),
-    "normal_permeability_1e6": Recipe(
-        group=FLOW, model="model1", hard="fracture walls without resistance", rock={"normal_permeability": 1e6}
-    ),
-    "lognormal": Recipe(
-        group=FLOW,
-        model="model1",
-        hard="permeability scattered over 6 decades from cell to cell",
-        twist={"lognormal": 6.0},
-    ),
-    "lognormal_12": Recipe(
-        group=FLOW,
-        model="model1",
-        hard="permeability scattered over 12 decades from cell to cell",
-        twist={"lognormal": 12.0},
-    ),
-    "aperture_1e-8": Recipe(
-        group=FLOW,
-        model="model1",
-        hard="hairline fractures: cells of the fracture with a volume of 1e-8",
-        parameters={"fracture_permeability": "cubic"},
-        rock=opening(1e-8),
-    ),
-    "aperture_1e-1": Recipe(
-        group=FLOW,
-        model="model1",
-        hard="wide fractures by the cubic law",
-        parameters={"fracture_permeability": "cubic"},
-        rock=opening(1e-1),
-    ),
-    "poisson_0.49": Recipe(
-        group=ROCK,
-        model="model1",
-        step=(1, 0),
-        hard="nearly incompressible rock, Poisson's ratio 0.49",
-        rock=lame(0.49),
-    ),
-    "poisson_0.4999": Recipe(
-        group=ROCK,
-        model="model1",
-        step=(1, 0),
-        hard="nearly incompressible rock, Poisson's ratio 0.4999",
-        rock=lame(0.4999),
-    ),
-    "stiffness_1e-6": Recipe(
-        group=ROCK, model="model1", hard="rock like mud: E 1e6 times smaller", rock=_stiffness(1e-6)
-    ),
-    "stiffness_1e6": Recipe(group=ROCK, model="model1", step=(1, 0), hard="E 1e6 times larger", rock=_stiffness(1e6)),
-    "biot_0": Recipe(
-        group=ROCK,
-        model="model1",
-        step=(1, 0),
-        hard="Biot coefficient 0: rock and flow act one way only, through fractures",
-        rock={"biot_coefficient": 0.0, "storage": 1e-11},
-    ),
-    "biot_1e-3": Recipe(
-        group=ROCK,
-        model="model1",
-        step=(1, 0),
-        hard="Biot coefficient 1e-3, less than the porosity: 1/M by the usual formula is negative",
-        rock={"biot_coefficient": 1e-3, "storage": 1e-11},
-    ),
-    "biot_1": Recipe(
-        group=ROCK, model="model1", hard="Biot coefficient 1: 1/M vanishes", rock={"biot_coefficient": 1.0}
-    ),
-    "incompressible_fluid": Recipe(
-        group=ROCK, model="model1", hard="incompressible fluid, c_f = 0", rock={"fluid_compressibility": 0.0}
-    ),
-    "no_storage_of_rock": Recipe(group=ROCK, model="model1", hard="1/M = 0", rock={"storage": 0.0}),
-    "no_storage": Recipe(
-        group=ROCK,
-        model="model1",
-        hard="c_f = 0 and 1/M = 0: the pressure block loses its storage",
-        rock={"biot_coefficient": 1.0, "fluid_compressibility": 0.0},
-    ),
-    "no_storage_tight": Recipe(
-        group=ROCK,
-        model="model1",
-        hard="no storage and no permeability: a saddle point",
-        rock={"biot_coefficient": 1.0, "fluid_compressibility": 0.0, "permeability": 1e-22},
-    ),
-    "time_step_1e-6": Recipe(
-        group=TIME, model="model1", hard="time step of 1e-6 s: undrained", case={"time_step": 1e-6}
-    ),
-    "time_step_1": Recipe(group=TIME, model="model1", hard="time step of 1 s", case={"time_step": 1.0}),
-    "time_step_1e6": Recipe(group=TIME, model="model1", hard="time step of 1e6 s", case={"time_step": 1e6}),
-    "time_step_1e10": Recipe(
-        group=TIME, model="model1", hard="time step of 1e10 s: steady flow", case={"time_step": 1e10}
-    ),
-    "undrained_saddle": Recipe(
-        group=TIME,
-        model="model1",
-        hard="time step of 1e-6 s without storage: the pressure block nearly vanishes",
-        case={"time_step": 1e-6},
-        rock={"biot_coefficient": 1.0, "fluid_compressibility": 0.0},
-    ),
-    "slivers": Recipe(
-        group=SHAPE,
-        step=(1, 0),
-        model="model1",
-        hard="domain 1 km by 1 m: cells of aspect ratio 1e3",
-        twist={"squeezed": 1e-3},
-    ),
-    "near_parallel": Recipe(
-        group=SHAPE,
-        hard="two fractures half a degree and 10 m apart",
-        case={"fractures": ((0.4, 0.5, 0.6, 0.5), (0.4, 0.51, 0.6, 0.512))},
-    ),
-    "near_touching": Recipe(
-        group=SHAPE,
-        hard="a gap of 2 m between two fractures",
-        case={"fractures": ((0.2, 0.5, 0.5, 0.5), (0.502, 0.5, 0.8, 0.6))},
-    ),
-    "acute_crossing": Recipe(
-        group=SHAPE,
-        hard="two fractures crossing at less than two degrees",
-        case={"fractures": ((0.46, 0.5, 0.54, 0.5), (0.46, 0.4985, 0.54, 0.5015))},
-    ),
-    "one_cell": Recipe(group=SHAPE, hard="a fracture of one cell", case={"fractures": ((0.5, 0.5, 0.53, 0.5),)}),
-    "at_boundary": Recipe(
-        group=SHAPE,
-        step=(1, 0),
-        hard="a fracture that ends on the boundary",
-        case={"fractures": ((0.0, 0.5, 0.5, 0.5),)},
-    ),
-    "cut_through": Recipe(
-        group=SHAPE,
-        hard="a fracture through the whole domain: one half is held by contact alone",
-        case={"fractures": ((0.0, 0.5, 1.0, 0.5),)},
-    ),
-    "thirty_fractures": Recipe(
-        group=SHAPE,
-        refinement=1.0,
-        twist={"cartesian": True},
-        hard="30 fractures with 15 intersections",
-        case={"fractures": _crosses(30)},
-    ),
-    "three_planes": Recipe(
-        group=SHAPE,
-        model="model3",
-        refinement=0.2,
-        step=(1, 1),
-        twist={"planes": True},
-        hard="3D, three lines of intersection that meet in a point",
-    ),
-}
+ALL_RECIPES = _read_recipes()
+RECIPES = {name: recipe for name, recipe in ALL_RECIPES.items() if recipe.group != HELD}
 """Name of an exported scene to what it is made by."""
+HELD_OUT = {name: recipe for name, recipe in ALL_RECIPES.items() if recipe.group == HELD}
+"""The same of those held out: drawn at random, all parameters at once, by code that commit d380ed0 has."""
 
 
 @cache
-def _collection(path: Path) -> Any:
-    """The exported scenes, as an open HDF5 file in memory."""
-    import h5py
-
+def _unpacked(path: Path) -> Any:
+    """The exported scenes, in a temporary file."""
     try:
-        return h5py.File(io.BytesIO(lzma.decompress(path.read_bytes())), "r")
+        found = tempfile.NamedTemporaryFile(suffix=".h5")
+        found.write(lzma.decompress(path.read_bytes()))
+        found.flush()
     except (OSError, lzma.LZMAError) as e:
         raise SceneError(f"{path}: cannot be read ({e}); make it anew with scripts/stress_scenes") from e
+    return found
 
 
 def load(name: str) -> Scene:
@@ -332,10 +101,10 @@ def load(name: str) -> Scene:
     if name.endswith(".h5"):
         return hdf5.read(COLLECTION.parent.parent / name)
     path = COLLECTION if name in RECIPES else HELD_OUT_COLLECTION
-    file = _collection(path)
-    if name not in file:
-        raise SceneError(f"{path}: has no scene {name!r}; make it anew with scripts/stress_scenes")
-    return hdf5.read_group(file[name])
+    with hdf5.open_file(Path(_unpacked(path).name)) as file:
+        if name not in file:
+            raise SceneError(f"{path}: has no scene {name!r}; make it anew with scripts/stress_scenes")
+        return hdf5.read_group(file[name])
 
 
 Rows = Mapping[str, float | NDArray[np.float64]]
@@ -431,7 +200,7 @@ def _rows_together(parts: list[tuple[CSR, NDArray[np.bool_]]], n: int) -> CSR:
     """Rows of several blocks, each with the rows that it gives."""
     rows, columns, data = [], [], []
     for block, keep in parts:
-        row = np.repeat(np.arange(n), np.diff(block.indptr))
+        row = rows_of(block)
         chosen = keep[row]
         rows.append(row[chosen])
         columns.append(np.asarray(block.indices)[chosen])
@@ -445,7 +214,7 @@ def _rows_together(parts: list[tuple[CSR, NDArray[np.bool_]]], n: int) -> CSR:
 def with_block_of_cell(scene: Scene, name: str, cell: int, factor: float) -> Scene:
     """The diagonal block of one cell multiplied by a factor."""
     block, bs = scene.blocks[name, name], scene.block_size(name)
-    row = np.repeat(np.arange(scene.sizes[name]), np.diff(block.indptr))
+    row = rows_of(block)
     inside = (row // bs == cell) & (np.asarray(block.indices) // bs == cell)
     data = np.where(inside, factor * block.data, block.data)
     return replace(scene, blocks={**scene.blocks, (name, name): block._replace(data=data)}, reference={})
@@ -486,6 +255,16 @@ def without_data(scene: Scene) -> Scene:
     return replace(scene, material=None, cell_volumes={}, cell_centers={}, cell_dimension=None, reference={})
 
 
+def with_rhs_scaled(scene: Scene, factor: float) -> Scene:
+    """A right-hand side times a number."""
+    return replace(scene, rhs={f: factor * v for f, v in scene.rhs.items()}, reference={})
+
+
+def with_cells_of(scene: Scene, other: str, cells: list[int]) -> Scene:
+    """See `with_rows_of`; the other scene by name."""
+    return with_rows_of(scene, load(other), cells)
+
+
 @dataclass(frozen=True, kw_only=True)
 class StressCase:
     """One extreme scene.
@@ -496,10 +275,8 @@ class StressCase:
         hard: what makes it hard, in a line.
         source: where it comes from, in words.
         make: the scene.
-        quick: whether `--suite quick` has it.
         singular: whether the matrix is singular, so that no solution or no single one exists.
         solvable: whether there is a solution, so that one that is handed on can be right.
-        held_out: whether no threshold was chosen on it, see `petsc_fs.tools.stress_held_out`.
     """
 
     name: str
@@ -507,10 +284,24 @@ class StressCase:
     hard: str
     source: str
     make: Callable[[], Scene]
-    quick: bool = False
     singular: bool = False
     solvable: bool = True
-    held_out: bool = False
+
+    @property
+    def quick(self) -> bool:
+        """Whether `--suite quick` has it."""
+        return self.name in QUICK
+
+    @property
+    def held_out(self) -> bool:
+        """Whether no threshold was chosen on it."""
+        return self.group == HELD
+
+    @classmethod
+    def exported(cls, name: str, recipe: Recipe) -> StressCase:
+        """A case that a PorePy model was exported for."""
+        source = f"PorePy, {recipe.model}, step {recipe.step[0]}:{recipe.step[1]}"
+        return cls(name=name, group=recipe.group, hard=recipe.hard, source=source, make=partial(load, name))
 
 
 QUICK = (
@@ -520,28 +311,14 @@ QUICK = (
 )  # fmt: skip
 
 
+Change = Callable[[Scene], Scene]
+
+
 def _transformed() -> list[StressCase]:
     """Cases made of other scenes."""
-    found: list[StressCase] = []
+    rows: list[tuple[str, str, str, str, Change]] = []  # name, group, what is hard, scene, change
 
-    def add(  # noqa: PLR0917
-        name: str,
-        group: str,
-        hard: str,
-        base: str,
-        change: Callable[[Scene], Scene],
-        singular: bool = False,
-        solvable: bool = True,
-    ) -> None:
-        words = f"{base}, {(change.func if isinstance(change, partial) else change).__name__.strip('<>')}"
-        found.append(
-            StressCase(
-                name=name, group=group, hard=hard, source=words, make=lambda: change(load(base)), quick=name in QUICK,
-                singular=singular, solvable=solvable,
-            )
-        )  # fmt: skip
-
-    systems: dict[str, dict[str, float]] = {
+    systems: dict[str, dict[str, Any]] = {
         "SI": {}, "mm": {"m": 1e-3}, "h": {"s": 3600.0}, "mm_h": {"kg": 1e10, "m": 1e-3, "s": 3600.0},
         "km_year": {"kg": 1e10, "m": 1e3, "s": 3.156e7},
     }  # fmt: skip
@@ -549,98 +326,185 @@ def _transformed() -> list[StressCase]:
         hard = f"units {', '.join(f'{k} = {v:g}' for k, v in ({'kg': 1.0, 'm': 1.0, 's': 1.0} | units).items())}"
         for base in ("base", "model1.h5", "model2.h5"):
             if base != "model2.h5" or label in ("mm", "h"):
-                add(f"units_{label}_{base.removesuffix('.h5')}", UNITS, hard, base, partial(in_units, **units))  # type: ignore[arg-type]
+                rows.append(
+                    (f"units_{label}_{base.removesuffix('.h5')}", UNITS, hard, base, partial(in_units, **units))
+                )
+    # fmt: off
     for base in ("biot.h5", "flow.h5", "contact.h5", "three_planes"):
-        add(f"units_SI_{base.removesuffix('.h5')}", UNITS, "SI units", base, partial(in_units))
-    add("units_mm_h_flow", UNITS, "mm and hours", "flow.h5", partial(in_units, m=1e-3, s=3600.0))
-    add("units_mm_h_biot", UNITS, "mm and hours", "biot.h5", partial(in_units, m=1e-3, s=3600.0))
+        rows.append((f"units_SI_{base.removesuffix('.h5')}", UNITS, "SI units", base, partial(in_units)))
+    for base in ("flow", "biot"):
+        change = partial(in_units, m=1e-3, s=3600.0)
+        rows.append((f"units_mm_h_{base}", UNITS, "mm and hours", f"{base}.h5", change))
     for power in (-8, 8):
-        add(
-            f"traction_1e{power}", CONTACT, f"traction counted in units of 1e{-power}", "base",
-            partial(scaled, columns={"contact": 10.0**power}),
-        )  # fmt: skip
-        add(
-            f"contact_rows_1e{power}", ALGEBRA, f"contact conditions multiplied by 1e{power}", "base",
-            partial(scaled, rows={"contact": 10.0**power}),
-        )  # fmt: skip
-        add(
-            f"mass_rows_1e{power}", ALGEBRA, f"mass balance multiplied by 1e{power}: its residual "
-            + ("is all there is" if power > 0 else "hides behind the others"), "base",
-            partial(scaled, rows={"mass": 10.0**power}),
-        )  # fmt: skip
-    add("force_rows_1e12", ALGEBRA, "balance of forces multiplied by 1e12: all other residuals hide", "base",
-        partial(scaled, rows={"intf_force": 1e12, "momentum": 1e12}))  # fmt: skip
-    add("flow_rows_scattered", ALGEBRA, "Darcy's law of each cell multiplied by a number, over 6 decades", "flow.h5",
-        partial(scattered, field_name="intf_flow", decades=6))  # fmt: skip
-    add("mass_rows_scattered", ALGEBRA, "mass balance of each cell multiplied by a number, over 6 decades", "base",
-        partial(scattered, field_name="mass", decades=6))  # fmt: skip
-    add("contact_rows_scattered", ALGEBRA, "contact conditions of each cell multiplied by a number, over 12 decades",
-        "base", partial(scattered, field_name="contact", decades=12))  # fmt: skip
-    for name, other, hard in (
-        ("one_cell_slides", "sliding", "all cells stick but one, which slides"),
-        ("one_cell_opens", "open", "all cells stick but one, which is open"),
-    ):
-        add(name, CONTACT, hard, "sticking",
-            partial(_one_from, other=other, cells=[7]))  # fmt: skip
-    add("every_second_slides", CONTACT, "cells stick and slide in turn", "sticking",
-        partial(_one_from, other="sliding", cells=list(range(0, 22, 2))))  # fmt: skip
-    add("nearly_singular_d22", CONTACT, "the interface block D_22 of one cell is 1e-13 of the others", "base",
-        partial(with_block_of_cell, name="intf_force", cell=3, factor=1e-13))  # fmt: skip
-    add("nearly_zero_j44", FLOW, "one diagonal entry of J_44 is 1e-13 of the others", "base",
-        partial(with_block_of_cell, name="intf_flow", cell=3, factor=1e-13))  # fmt: skip
-    add("zero_j44", FLOW, "one diagonal entry of J_44 is zero, the matrix is not singular", "base",
-        partial(with_block_of_cell, name="intf_flow", cell=3, factor=0.0))  # fmt: skip
-    add("wrong_time_step", ALGEBRA, "material data with a time step 1e6 too long: fixed stress hardly acts", "base",
-        partial(with_material, time_step=900.0 * 1e6))  # fmt: skip
-    add("wrong_stiffness", ALGEBRA, "material data with a stiffness 1e6 too small: fixed stress overwhelms", "base",
-        partial(with_material, shear_modulus=1e-6, lame_lambda=1e-6))  # fmt: skip
-    add("without_data", ALGEBRA, "no material data, no geometry", "base", without_data)
-    add("zero_rhs", ALGEBRA, "right-hand side zero", "base", partial(with_rhs))
-    add(
-        "only_mass_driven",
-        ALGEBRA,
-        "only the mass balance has a right-hand side",
-        "base",
-        partial(with_rhs, fields=("mass",)),
-    )
-    add("only_contact_driven", ALGEBRA, "only the contact conditions have a right-hand side", "base",
-        partial(with_rhs, fields=("contact",)))  # fmt: skip
-    add("tiny_rhs", ALGEBRA, "right-hand side of 1e-150: absolute tolerances are met at once", "base",
-        partial(_all_rhs, factor=1e-150))  # fmt: skip
-    add("huge_rhs", ALGEBRA, "right-hand side of 1e150: squares overflow", "base", partial(_all_rhs, factor=1e160))
-    add("small_rhs", ALGEBRA, "a late Newton step: right-hand side 1e-12 of the first, near the absolute tolerance",
-        "base", partial(_all_rhs, factor=1e-12))  # fmt: skip
-    add("zero_equation", ALGEBRA, "one equation is lost: singular", "base",
-        partial(without_row, name="mass", row=5), singular=True)  # fmt: skip
-    add("contradiction", ALGEBRA, "the same equation twice with different right-hand sides: no solution", "base",
-        partial(with_row_twice, name="mass", consistent=False), singular=True, solvable=False)  # fmt: skip
-    add("repetition", ALGEBRA, "the same equation twice: many solutions", "base",
-        partial(with_row_twice, name="mass", consistent=True), singular=True)  # fmt: skip
+        factor = 10.0**power
+        hides = "is all there is" if power > 0 else "hides behind the others"
+        rows += [
+            (f"traction_1e{power}", CONTACT, f"traction counted in units of 1e{-power}", "base",
+             partial(scaled, columns={"contact": factor})),
+            (f"contact_rows_1e{power}", ALGEBRA, f"contact conditions multiplied by 1e{power}", "base",
+             partial(scaled, rows={"contact": factor})),
+            (f"mass_rows_1e{power}", ALGEBRA, f"mass balance multiplied by 1e{power}: its residual {hides}", "base",
+             partial(scaled, rows={"mass": factor})),
+        ]
+    rows += [
+        ("force_rows_1e12", ALGEBRA, "balance of forces multiplied by 1e12: all other residuals hide", "base",
+         partial(scaled, rows={"intf_force": 1e12, "momentum": 1e12})),
+        ("flow_rows_scattered", ALGEBRA, "Darcy's law of each cell multiplied by a number, over 6 decades", "flow.h5",
+         partial(scattered, field_name="intf_flow", decades=6)),
+        ("mass_rows_scattered", ALGEBRA, "mass balance of each cell multiplied by a number, over 6 decades", "base",
+         partial(scattered, field_name="mass", decades=6)),
+        ("contact_rows_scattered", ALGEBRA, "contact conditions of each cell times a number, over 12 decades", "base",
+         partial(scattered, field_name="contact", decades=12)),
+        ("one_cell_slides", CONTACT, "all cells stick but one, which slides", "sticking",
+         partial(with_cells_of, other="sliding", cells=[7])),
+        ("one_cell_opens", CONTACT, "all cells stick but one, which is open", "sticking",
+         partial(with_cells_of, other="open", cells=[7])),
+        ("every_second_slides", CONTACT, "cells stick and slide in turn", "sticking",
+         partial(with_cells_of, other="sliding", cells=list(range(0, 22, 2)))),
+        ("nearly_singular_d22", CONTACT, "the interface block D_22 of one cell is 1e-13 of the others", "base",
+         partial(with_block_of_cell, name="intf_force", cell=3, factor=1e-13)),
+        ("nearly_zero_j44", FLOW, "one diagonal entry of J_44 is 1e-13 of the others", "base",
+         partial(with_block_of_cell, name="intf_flow", cell=3, factor=1e-13)),
+        ("zero_j44", FLOW, "one diagonal entry of J_44 is zero, the matrix is not singular", "base",
+         partial(with_block_of_cell, name="intf_flow", cell=3, factor=0.0)),
+        ("wrong_time_step", ALGEBRA, "material data with a time step 1e6 too long: fixed stress hardly acts", "base",
+         partial(with_material, time_step=900.0 * 1e6)),
+        ("wrong_stiffness", ALGEBRA, "material data with a stiffness 1e6 too small: fixed stress overwhelms", "base",
+         partial(with_material, shear_modulus=1e-6, lame_lambda=1e-6)),
+        ("without_data", ALGEBRA, "no material data, no geometry", "base", without_data),
+        ("zero_rhs", ALGEBRA, "right-hand side zero", "base", partial(with_rhs)),
+        ("only_mass_driven", ALGEBRA, "only the mass balance has a right-hand side", "base",
+         partial(with_rhs, fields=("mass",))),
+        ("only_contact_driven", ALGEBRA, "only the contact conditions have a right-hand side", "base",
+         partial(with_rhs, fields=("contact",))),
+        ("tiny_rhs", ALGEBRA, "right-hand side of 1e-150: absolute tolerances are met at once", "base",
+         partial(with_rhs_scaled, factor=1e-150)),
+        ("huge_rhs", ALGEBRA, "right-hand side of 1e160: squares overflow", "base",
+         partial(with_rhs_scaled, factor=1e160)),
+        ("small_rhs", ALGEBRA, "a late Newton step: right-hand side 1e-12 of the first", "base",
+         partial(with_rhs_scaled, factor=1e-12)),
+        ("zero_equation", ALGEBRA, "one equation is lost: singular", "base", partial(without_row, name="mass", row=5)),
+        ("contradiction", ALGEBRA, "the same equation twice with different right-hand sides: no solution", "base",
+         partial(with_row_twice, name="mass", consistent=False)),
+        ("repetition", ALGEBRA, "the same equation twice: many solutions", "base",
+         partial(with_row_twice, name="mass", consistent=True)),
+    ]
+    # fmt: on
+    return [
+        StressCase(
+            name=name,
+            group=group,
+            hard=hard,
+            source=f"{base}, {(change.func if isinstance(change, partial) else change).__name__}",
+            make=partial(_changed, base, change),
+            singular=name in ("zero_equation", "contradiction", "repetition"),
+            solvable=name != "contradiction",
+        )
+        for name, group, hard, base, change in rows
+    ]
+
+
+def _changed(base: str, change: Change) -> Scene:
+    return change(load(base))
+
+
+SEED = 20250131
+TRANSFORMED = 14
+BASES = (
+    "model1.h5", "model2.h5", "model3.h5", "biot.h5", "flow.h5", "contact.h5", "three_planes", "thirty_fractures",
+    "acute_crossing", "lognormal", "near_touching", "friction_0.1", "cubic_law",
+)  # fmt: skip
+"""What is transformed: bundled scenes and exported ones."""
+
+
+def drawn_changes(number: int) -> tuple[list[str], Change]:
+    """The two or three random changes of a held-out case: in words, and what makes them."""
+
+    def change(scene: Scene) -> Scene:
+        random = np.random.default_rng([SEED, 1000 + number])
+        for name in names(random):
+            scene = CHANGES[name](scene, random)
+        return scene
+
+    def names(random: np.random.Generator) -> list[str]:
+        shuffled: list[str] = random.permutation(list(CHANGES)).tolist()
+        return shuffled[: int(random.integers(2, 4))]
+
+    return names(np.random.default_rng([SEED, 1000 + number])), change
+
+
+def _units(scene: Scene, random: np.random.Generator) -> Scene:
+    kg, m, s = 10.0 ** random.uniform((0, -3, 0), (10, 3, 7))
+    return in_units(scene, kg=float(kg), m=float(m), s=float(s))
+
+
+def _rows(scene: Scene, random: np.random.Generator) -> Scene:
+    return scaled(scene, rows={f: float(10.0 ** random.uniform(-4, 4)) for f in scene.fields})
+
+
+def _columns(scene: Scene, random: np.random.Generator) -> Scene:
+    return scaled(scene, columns={f: float(10.0 ** random.uniform(-6, 6)) for f in scene.fields})
+
+
+def _scattered_rows(scene: Scene, random: np.random.Generator) -> Scene:
+    name = str(random.choice(scene.fields))
+    return scattered(scene, name, decades=float(random.uniform(1, 5)), seed=int(random.integers(2**31)))
+
+
+def _scattered_columns(scene: Scene, random: np.random.Generator) -> Scene:
+    name = str(random.choice(scene.fields))
+    cells = scene.sizes[name] // scene.block_size(name)
+    factors = 10.0 ** (random.uniform(1, 3) * (random.random(cells) - 0.5))
+    return scaled(scene, columns={name: np.repeat(factors, scene.block_size(name))})
+
+
+def _rhs(scene: Scene, random: np.random.Generator) -> Scene:
+    rhs = {f: random.standard_normal(v.size) * (np.linalg.norm(v) or 1.0) for f, v in scene.rhs.items()}
+    return replace(scene, rhs=rhs, reference={})
+
+
+def _rhs_scaled(scene: Scene, random: np.random.Generator) -> Scene:
+    factor = float(10.0 ** random.uniform(-60, 60))
+    return with_rhs_scaled(scene, factor)
+
+
+def _material(scene: Scene, random: np.random.Generator) -> Scene:
+    if scene.material is None:
+        return scene
+    factor = float(10.0 ** random.uniform(-1, 1))
+    return with_material(scene, shear_modulus=factor, lame_lambda=factor)
+
+
+CHANGES: dict[str, Callable[[Scene, np.random.Generator], Scene]] = {
+    "random units": _units,
+    "equations of each field times a number over 8 decades": _rows,
+    "unknowns of each field times a number over 12 decades": _columns,
+    "equations of one field scattered over 1 to 5 decades": _scattered_rows,
+    "unknowns of one field scattered over 1 to 3 decades": _scattered_columns,
+    "random right-hand side": _rhs,
+    "right-hand side times a number over 120 decades": _rhs_scaled,
+    "stiffness that fixed stress is told off by up to 10": _material,
+}
+
+
+def held_out() -> list[StressCase]:
+    """All held-out cases."""
+    found = [StressCase.exported(name, recipe) for name, recipe in HELD_OUT.items()]
+    for k in range(TRANSFORMED):
+        base = BASES[k % len(BASES)]
+        words, change = drawn_changes(k)
+        found.append(
+            StressCase(
+                name=f"held_out_{base.removesuffix('.h5')}_{k:02}",
+                group=HELD,
+                hard="; ".join(words),
+                source=f"{base}, random changes",
+                make=partial(_changed, base, change),
+            )
+        )
     return found
 
 
-def _one_from(scene: Scene, other: str, cells: list[int]) -> Scene:
-    return with_rows_of(scene, load(other), cells)
-
-
-def _all_rhs(scene: Scene, factor: float) -> Scene:
-    return replace(scene, rhs={f: factor * v for f, v in scene.rhs.items()}, reference={})
-
-
-def exported(name: str, recipe: Recipe, *, quick: bool = False, held_out: bool = False) -> StressCase:
-    """A case that a PorePy model was exported for."""
-    source = f"PorePy, {recipe.model}, step {recipe.step[0]}:{recipe.step[1]}"
-    return StressCase(
-        name=name,
-        group=recipe.group,
-        hard=recipe.hard,
-        source=source,
-        make=partial(load, name),
-        quick=quick,
-        held_out=held_out,
-    )
-
-
 def catalogue() -> list[StressCase]:
-    """All cases, exported scenes first."""
-    return [exported(name, recipe, quick=name in QUICK) for name, recipe in RECIPES.items()] + _transformed()
+    """All cases but those held out, exported scenes first."""
+    return [StressCase.exported(name, recipe) for name, recipe in RECIPES.items()] + _transformed()

@@ -1,0 +1,235 @@
+"""Refinement: one solve, with corrections as the user's system asks for them, and a word on its error."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from petsc_fs import nest
+from petsc_fs.errors import SolveError
+from petsc_fs.petsc_errors import reason_name, translate
+from petsc_fs.system import EPS, System, norm
+
+MOST_PASSES = 20
+"""The Krylov method and its corrections; each has to halve what is missing."""
+PETSC_ATOL = 1e-50
+"""PETSc's own absolute tolerance, which stands for none."""
+MARGIN = 0.3
+"""Part of a tolerance that the Krylov method is given, whose norm is not the user's: without it most solves would
+need a correction, with it they need at most two iterations more."""
+LEAST_RTOL = 1e-12
+"""Tolerance of the Krylov method that its recursion can still keep."""
+WELL_DETERMINED = 1e-3
+"""Estimated relative error of each field up to which a solution is taken as it is."""
+DETERMINED = 1e-2
+"""Relative error of each field, where it is measured, up to which a solution counts as one."""
+MEASURE = 0.1
+"""Relative tolerance where errors are measured."""
+MOST_IMPROVEMENTS = 3
+"""Corrections for the sake of the estimated error."""
+LIMIT = 1e-14
+"""Backward error that no correction lessens any more."""
+
+
+class Refinement:
+    """One solve: a Krylov method on the equilibrated system, and corrections as the user's system asks for them.
+
+    Attributes:
+        x: the solution so far, of the system as it is in PETSc.
+        check: how well it satisfies the user's system.
+        missing: by what factor it misses the tolerances.
+        goal: tolerance of the residual, relative to |b|.
+        field_goal: backward error that each field may have.
+        estimates: estimated relative error of each field.
+        is_determined: whether the equations determine the solution to `DETERMINED`.
+    """
+
+    def __init__(self, system: System, ksp: PETSc.KSP, rtol: float, atol: float) -> None:
+        self.system, self.ksp, self.rtol = system, ksp, rtol
+        self.x, self.r, self.d = (system.b.duplicate() for _ in range(3))
+        self.max_it = int(ksp.getTolerances()[3])
+        self.iterations = self.passes = 0
+        self.reason = "CONVERGED_ATOL"
+        self.history: list[NDArray[np.float64]] = []
+        self.notes: tuple[str, ...] = ()
+        self.estimates: dict[str, float] = {}
+        self.is_determined = True
+        self.x.set(0.0)
+        self.check = system.check(self.x, self.r)
+        size = norm(self.check.rhs)
+        self.goal = max(rtol, math.ldexp(atol, system.rhs_scale) / size) if size else 1.0
+        self.field_goal = rtol
+        self.missing = self.check.excess(self.goal, self.field_goal) if size else 0.0
+
+    def first(self) -> None:
+        """The Krylov method by its options. Collective."""
+        if self.missing > 1.0:
+            self._pass(MARGIN * max(self.rtol, min(self.goal, 0.5)))
+            self.x.axpy(1.0, self.d)
+            self._judge()
+
+    def correct(self) -> None:
+        """Corrections, as long as each of them halves what is missing. Collective.
+
+        The Krylov method stops in the norm of the equilibrated system, by a recursion that rounding may lead astray.
+        """
+        if self.ksp.getType() == PETSc.KSP.Type.PREONLY:
+            return
+        while self.missing > 1.0 and self.passes < MOST_PASSES and self.iterations < self.max_it:
+            old = self.missing
+            self._pass(min(max(MARGIN / old, LEAST_RTOL), 0.5))
+            self._take_step()
+            if self.missing > 0.5 * old:
+                return
+
+    def _take_step(self) -> None:
+        """Add what the last pass has found, unless that makes it worse. Collective."""
+        old = self.missing
+        self.x.axpy(1.0, self.d)
+        self._judge()
+        if self.missing > max(old, 1.0):
+            self.x.axpy(-1.0, self.d)
+            self._judge()
+
+    def estimate_error(self) -> None:
+        """Estimate the error of each field; where that casts doubt, improve the solution, or measure it. Collective.
+
+        One application of the preconditioner to the residual is an estimate, divided by the least singular value that
+        GMRES has seen. To measure the error is to solve for a residual of this size with a part at random, whatever
+        the preconditioner is worth: a solution that the equations do not determine changes beyond measure.
+        """
+        if self.missing > 1.0 or not self.passes:
+            return
+        least, doubtful = self._least_singular_value(), False
+        for _ in range(MOST_IMPROVEMENTS):
+            self._precondition()
+            steps, eta = self._relative(self.d), max(self.check.backward.values())
+            self.estimates = {f: e / least for f, e in steps.items()}
+            if max(self.estimates.values()) <= WELL_DETERMINED and not doubtful:
+                return
+            step = max(steps.values())
+            final = eta <= LIMIT or self.ksp.getType() == PETSc.KSP.Type.PREONLY
+            if step <= WELL_DETERMINED or final:
+                found, doubtful = self._measured(), True
+                self.estimates = found or self.estimates
+                if found is not None and max(found.values()) <= DETERMINED:
+                    return
+                if final or found is None:
+                    break
+                step = max(found.values())
+            self._pass(min(max(MARGIN * WELL_DETERMINED / step, 1e-4), MARGIN))
+            least = min(least, self._least_singular_value())
+            self._take_step()
+            if self.missing > 1.0 or self.iterations >= self.max_it:
+                break
+        self.is_determined = False
+        found = {f: e for f, e in self.estimates.items() if not e <= DETERMINED} or self.estimates
+        self.notes += (
+            "ill-conditioned: the residual is small, but says little of the error, which is estimated at "
+            + ", ".join(f"{e:.0e} ({f})" for f, e in found.items())
+            + f" of the solution; at most {DETERMINED:g} counts as converged",
+        )
+
+    def _least_singular_value(self) -> float:
+        """The least one of A M^-1 that GMRES has seen, at most 1; 1 for other methods. Local."""
+        if self.ksp.getType() != PETSc.KSP.Type.GMRES or not self.ksp.getIterationNumber():
+            return 1.0
+        return min(1.0, max(float(self.ksp.computeExtremeSingularValues()[1]), EPS))
+
+    def _precondition(self) -> None:
+        """D = M^-1 r. Collective."""
+        try:
+            self.ksp.getPC().apply(self.r, self.d)
+        except (PETSc.Error, ImportError) as e:
+            raise translate(e, "the preconditioner failed") from None
+        self._leave_null_space()
+
+    def _leave_null_space(self) -> None:
+        """Take out of `d` what the matrix maps to zero, where that is known. Collective."""
+        space = self.ksp.getOperators()[0].getNullSpace()
+        if space:
+            space.remove(self.d)
+
+    def _measured(self) -> dict[str, float] | None:
+        """Relative size of what a residual of this size may be worth; None if that cannot be solved for. Collective."""
+        system = self.system
+        draw = np.random.default_rng(system.layout.comm.rank)
+        random = {f: draw.standard_normal(v.size) for f, v in system.by_field(self.r).items()}
+        there, sizes = system.norms(system.by_field(self.r)), system.norms(random)
+        parts = [v * (there[f] / (sizes[f] or 1.0)) for f, v in random.items()]
+        kept = self.r.copy()
+        self.r.setArray(self.r.getArray() + np.concatenate(parts))
+        self._pass(MEASURE)
+        kept.copy(self.r)
+        kept.destroy()
+        return self._relative(self.d) if self.reason.startswith("CONVERGED") else None
+
+    def _relative(self, part: PETSc.Vec) -> dict[str, float]:
+        """Size of each field of a vector beside that of the solution, or beside what would change any equation."""
+        sizes = self.system.norms(self.system.by_field(self.x))
+        least = self.system.least_sizes(self.check, self.field_goal)
+        found = self.system.norms(self.system.by_field(part))
+        return {f: n / (max(sizes[f], least[f]) or 1.0) for f, n in found.items()}
+
+    def _pass(self, rtol: float) -> None:
+        """Run a Krylov method on the present residual; what it finds is in `d`. Collective."""
+        ksp = self.ksp
+        ksp.setTolerances(rtol=rtol, atol=0.0, max_it=max(self.max_it - self.iterations, 1))
+        try:
+            ksp.solve(self.r, self.d)
+        except (PETSc.Error, ImportError) as e:
+            raise translate(e, "solve failed") from None
+        self._leave_null_space()
+        self.passes += 1
+        self.iterations += ksp.getIterationNumber()
+        self.history.append(np.array(ksp.getConvergenceHistory()))
+        self.reason = reason_name(ksp)
+
+    def _judge(self) -> None:
+        """See where x stands. Collective.
+
+        Raises:
+            SolveError: it is not finite.
+        """
+        self.check = self.system.check(self.x, self.r)
+        self.missing = self.check.excess(self.goal, self.field_goal)
+        if not math.isfinite(self.missing):
+            where = broken_level(self.ksp.getPC())
+            raise SolveError(
+                f"the solution is not finite after {self.iterations} iterations ({self.reason})"
+                + (f"; {where}" if where else "")
+            )
+        if self.missing > 1.0:
+            self.check = self.system.check(self.x, self.r, exactly=True)
+            self.missing = self.check.excess(self.goal, self.field_goal)
+
+    def destroy(self) -> None:
+        """Collective."""
+        for vector in (self.x, self.r, self.d):
+            vector.destroy()
+
+
+def broken_level(pc: PETSc.PC) -> str:
+    """The innermost level of a set-up tree that turns ones into numbers that are not finite; "" if there is none.
+
+    Collective.
+    """
+    for part in reversed(list(nest.levels(pc))):
+        x, y = part.getOperators()[1].createVecs()
+        x.set(1.0)
+        y.set(0.0)
+        try:
+            part.apply(x, y)
+            what = "" if math.isfinite(y.norm()) else "turns ones into numbers that are not finite"
+        except PETSc.Error as e:
+            what = f"fails (error {e.ierr})"
+        for v in (x, y):
+            v.destroy()
+        if what:
+            kind, prefix = part.getType(), f"-{part.getOptionsPrefix() or ''}"
+            hint = f"; if it is MUMPS, raise {prefix}mat_mumps_icntl_14" if kind in ("lu", "cholesky") else ""
+            return f"level {prefix} ({kind}) {what}{hint}"
+    return ""
