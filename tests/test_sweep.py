@@ -477,10 +477,18 @@ def test_two_sweeps_in_a_folder_do_not_mix(tmp_path: Path, made_up: Any) -> None
 
 # --- searches in earnest
 
-FAULTY_BASE = BASE.replace(
-    "-prefix_push", "-pc_type python\n-pc_python_type petsc_fs.pc.Assembled\n-prefix_push assembled_\n-prefix_push"
-)
-FAULTY_BASE = FAULTY_BASE + "-prefix_pop\n"
+FAULTY_BASE = """\
+# One factorisation
+#
+# fields: intf_flow mass
+
+-ksp_type gmres
+-ksp_rtol 1e-8
+-ksp_pc_side right
+-pc_type python
+-pc_python_type petsc_fs.pc.Assembled
+-assembled_pc_type lu
+"""
 
 FAULTY = """\
 base: base.opts
@@ -489,18 +497,15 @@ groups:
     parameters:
       which:
         choices:
-          good: {assembled_sub_pc_factor_levels: 1}
+          good: {assembled_pc_factor_mat_solver_type: mumps}
           diverging: {pc_python_type: tests.faulty.Growing, ksp_type: richardson, ksp_max_it: 3, ksp_pc_side: ~,
-                      assembled_pc_type: ~, assembled_sub_ksp_type: ~, assembled_sub_pc_type: ~}
-          stagnating: {ksp_max_it: 1}
-          crashing: {pc_python_type: tests.faulty.Crashing, assembled_pc_type: ~, assembled_sub_ksp_type: ~,
-                     assembled_sub_pc_type: ~}
-          hanging: {pc_python_type: tests.faulty.Hanging, assembled_pc_type: ~, assembled_sub_ksp_type: ~,
-                    assembled_sub_pc_type: ~}
-          hungry: {pc_python_type: tests.faulty.Hungry, assembled_pc_type: ~, assembled_sub_ksp_type: ~,
-                   assembled_sub_pc_type: ~}
-          misspelt: {assembled_sub_pc_factor_levles: 1}
-          impossible: {assembled_sub_pc_type: iul}
+                      assembled_pc_type: ~}
+          stagnating: {assembled_pc_type: ilu, ksp_max_it: 30}
+          crashing: {pc_python_type: tests.faulty.Crashing, assembled_pc_type: ~}
+          hanging: {pc_python_type: tests.faulty.Hanging, assembled_pc_type: ~}
+          hungry: {pc_python_type: tests.faulty.Hungry, assembled_pc_type: ~}
+          misspelt: {assembled_pc_factor_mat_solver_tpye: mumps}
+          impossible: {assembled_pc_type: ul}
 """
 
 EXPECTED = {
@@ -528,7 +533,7 @@ def test_each_way_to_fail_is_recorded_as_what_it_is(
     results = json.loads((out / "sweep.json").read_text())
     assert {t["values"]["all.which"]: t["outcome"] for t in results["trials"]} == EXPECTED
     said = {t["values"]["all.which"]: t["message"] for t in results["trials"]}
-    assert "assembled_sub_pc_factor_levels" in said["misspelt"]  # what it might have meant
+    assert "assembled_pc_factor_mat_solver_type" in said["misspelt"]  # what it might have meant
     assert "SIGSEGV" in said["crashing"]
     assert "within 10 s" in said["hanging"]
     assert results["outcomes"] == dict.fromkeys(EXPECTED.values(), 1)
@@ -538,7 +543,7 @@ def test_each_way_to_fail_is_recorded_as_what_it_is(
     assert header.fields == ("intf_flow", "mass")
     assert not header.default
     assert options.parse(out / "best.opts") == options.parse(tmp_path / "base.opts") | {
-        "assembled_sub_pc_factor_levels": "1"
+        "assembled_pc_factor_mat_solver_type": "mumps"
     }
     for page in (out / "report.md", tmp_path / "page.md"):
         text = page.read_text()
