@@ -29,6 +29,8 @@ DETERMINED = 1e-2
 """Relative error of each field, where it is measured, up to which a solution counts as one."""
 MEASURE = 0.1
 """Relative tolerance where errors are measured."""
+SOLVED = 0.5
+"""Relative residual, computed anew, up to which that has worked."""
 MOST_IMPROVEMENTS = 3
 """Corrections for the sake of the estimated error."""
 LIMIT = 1e-14
@@ -160,12 +162,16 @@ class Refinement:
         there, random = system.norms(system.by_field(self.r)), {f: scattered(system, f) for f in system.layout.fields}
         sizes = system.norms(random)
         parts = [v * (there[f] / (sizes[f] or 1.0)) for f, v in random.items()]
-        kept, reason = self.r.copy(), self.reason
+        kept, reason, rest = self.r.copy(), self.reason, self.r.duplicate()
         self.r.setArray(self.r.getArray() + np.concatenate(parts))
         self._pass(MEASURE)
+        self.ksp.getOperators()[0].mult(self.d, rest)
+        rest.aypx(-1.0, self.r)
+        solved = rest.norm() <= SOLVED * self.r.norm()
         kept.copy(self.r)
-        kept.destroy()
-        solved, self.reason = self.reason.startswith("CONVERGED"), reason
+        self.reason = reason
+        for vector in (kept, rest):
+            vector.destroy()
         return self._relative(self.d) if solved else None
 
     def _relative(self, part: PETSc.Vec) -> dict[str, float]:
