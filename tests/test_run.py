@@ -17,8 +17,7 @@ import petsc_fs
 from petsc_fs.cli import main as cli
 from petsc_fs.io import sequence
 from petsc_fs.porepy.cases import CASES
-from petsc_fs.porepy.observation import PHASES
-from petsc_fs.porepy.simulation import PICTURE, RECORDS, SEQUENCE, SUMMARY, VTU
+from petsc_fs.porepy.simulation import PHASES, PICTURE, RECORDS, SEQUENCE, SUMMARY, VTU
 
 MPIEXEC = Path(petsc_fs.__path__[0]).parent / "scripts" / "mpiexec"
 ENVIRONMENT = dict(os.environ, OMP_NUM_THREADS="1")

@@ -36,7 +36,8 @@ MODULES = {
 }
 """Commands with a module of their own: summary, and the module. It has `add_arguments(parser)`, which describes the
 arguments, and `command(args, petsc, comm)`, which runs and returns the exit code, collectively on all ranks; it is
-imported only where its command is called. A run leaves what is to be shown of it in `args.summary`, on rank 0."""
+imported only where its command is called. A run leaves what is to be shown of it in `args.summary`, on rank 0, and a
+command what is to be called at its end, whether it has failed or not, in `args.close`. Collective."""
 
 SECONDS_TO_AGREE = 5.0
 """How long ranks wait for each other after an error before they take the others for stuck."""
@@ -75,6 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+    args, message, code = argparse.Namespace(close=None), "", 0
     try:
         own, petsc = split_arguments(sys.argv[1:] if argv is None else argv)
         try:
@@ -92,16 +94,20 @@ def main(argv: Sequence[str] | None = None) -> int:
 
             print(run_table(args.summary))
         sys.stdout.flush()
-        return code
     except PetscFsError as e:
-        return _fail(comm, f"petsc-fs: {e}", e.exit_code)
+        message, code = str(e), e.exit_code
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # or Python tries once more at its end
-        return _fail(comm, "petsc-fs: standard output was closed before all was written", CUT_OFF)
+        message, code = "standard output was closed before all was written", CUT_OFF
     except KeyboardInterrupt as e:
-        return _fail(comm, f"petsc-fs: {str(e) or 'interrupted'}", INTERRUPTED)
+        message, code = str(e) or "interrupted", INTERRUPTED
     except BaseException as e:
-        return _fail(comm, f"petsc-fs: {_describe(e)}", PetscFsError.exit_code)
+        message, code = _describe(e), PetscFsError.exit_code
+    if message:
+        _fail(comm, f"petsc-fs: {message}", code)
+    if args.close is not None:  # all ranks are here, and no frame of an error holds PETSc's objects any more
+        args.close()
+    return code
 
 
 def split_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -136,8 +142,8 @@ def _is_scene(word: str) -> bool:
         return False
 
 
-def _fail(comm: MPI.Intracomm, message: str, code: int) -> int:
-    """Print one message and return the code if all ranks failed; else end the ranks that are stuck."""
+def _fail(comm: MPI.Intracomm, message: str, code: int) -> None:
+    """Print one message if all ranks failed; else end the ranks that are stuck."""
     request = comm.Ibarrier()
     deadline = time.monotonic() + (SECONDS_TO_AGREE if comm.size > 1 else 0)
     while not (agreed := request.Test()) and time.monotonic() < deadline:
@@ -148,7 +154,6 @@ def _fail(comm: MPI.Intracomm, message: str, code: int) -> int:
             print(message + where, file=sys.stderr, flush=True)
     if not agreed:
         comm.Abort(code)
-    return code
 
 
 def _describe(error: BaseException) -> str:
@@ -171,7 +176,7 @@ class _Parser(argparse.ArgumentParser):
 def _parser(command: list[str]) -> argparse.ArgumentParser:
     raw = argparse.RawDescriptionHelpFormatter
     parser = _Parser(prog="petsc-fs", description=DESCRIPTION, formatter_class=raw)
-    parser.set_defaults(summary=None)
+    parser.set_defaults(summary=None, close=None)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def add(name: str, summary: str, run: Any, **more: Any) -> argparse.ArgumentParser:

@@ -98,6 +98,7 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
     return_freed()
     smallest = not given.files or "pc_type" not in given.values
     player = Player(path, comm, smallest=smallest)
+    args.close = player.close
     records = []
     warning = ""
     for step in _progress(steps, comm):
@@ -123,7 +124,6 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
             write_text(args.report, json.dumps(finite(report), indent=2, allow_nan=False) + "\n")
         if solution is not None and player.scene is not None:
             hdf5.write_solution(solution, args.save, player.scene)
-    player.close()
     if comm.rank == 0:
         from petsc_fs.cli import tables
 

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import atexit
 import ctypes
+import functools
+import sys
+import traceback
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any
 
 from petsc4py import PETSc
 
 from petsc_fs import nest
-from petsc_fs.errors import UsageError
+from petsc_fs.errors import PetscFsError, UsageError
 
 _alive: dict[int, None] = {}
 """Handles of the PCs that have a context of ours, in the order of their making."""
@@ -30,6 +34,30 @@ def _end() -> None:
         nest.call("PCSetType", ctypes.c_void_p(handle), b"none")
 
 
+def told(method: Callable[..., None]) -> Callable[..., None]:
+    """A method that PETSc calls, which prints its errors where nobody else would.
+
+    Through PETSc an error comes to a program in Python as it is, but to one in C or Fortran as a blank one. PETSc has
+    printed its own errors by then. What happened on all ranks is printed by all, for the first to end ends the others.
+    """
+
+    @functools.wraps(method)
+    def told_method(self: BasePC, pc: PETSc.PC, *vectors: PETSc.Vec) -> None:
+        try:
+            method(self, pc, *vectors)
+        except Exception as e:
+            if not hasattr(e, "__notes__"):  # else it has come through another PC of ours
+                e.add_note(f"in {type(self).__name__} with options -{pc.getOptionsPrefix() or ''}")
+                if not sys.orig_argv and not isinstance(e, PETSc.Error):  # the interpreter was started by PETSc
+                    if not isinstance(e, PetscFsError):
+                        traceback.print_exc()
+                    sys.stderr.write(f"[{pc.comm.rank}] petsc_fs: {e}\n")
+                    sys.stderr.flush()
+            raise
+
+    return told_method
+
+
 class BasePC(ABC):
     """A PC in Python with inner PCs, which PETSc sets up as often as it has a new matrix.
 
@@ -46,9 +74,11 @@ class BasePC(ABC):
         """Note that the PC is there: it may never be set up, where another one fails. Local."""
         _alive[pc.handle] = None
 
+    @told
     def setUp(self, pc: PETSc.PC) -> None:
         """Take a new matrix. Collective."""
         self.update(pc)
+        PETSc.garbage_cleanup(pc.comm)  # on several ranks petsc4py keeps what Python drops
 
     @abstractmethod
     def update(self, pc: PETSc.PC) -> None:
@@ -115,6 +145,7 @@ class WrapperPC(BasePC):
         if before is not None:
             before.destroy()
 
+    @told
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Y = inner PC applied to x. Collective."""
         self.inners[0].apply(x, y)

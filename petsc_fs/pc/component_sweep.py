@@ -10,7 +10,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from petsc_fs.errors import LayoutError, SceneError
-from petsc_fs.pc.base import BasePC, choice
+from petsc_fs.pc.base import BasePC, choice, told
 
 ORDERS = ("forward", "backward", "none")
 """Values of -component_order; the first is the default."""
@@ -85,6 +85,7 @@ class ComponentSweep(BasePC):
                 coupling.scale(-1.0)  # so that a product adds what is subtracted
                 self._couplings[k].append((coupling, self._y[m]))
 
+    @told
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Y = one sweep over the components of x, from zero. Collective."""
         D = len(self.inners)

@@ -10,7 +10,7 @@ from petsc4py import PETSc
 from petsc_fs import nest
 from petsc_fs.errors import LayoutError, UsageError
 from petsc_fs.nest import Blocks
-from petsc_fs.pc.base import WrapperPC, choice, text
+from petsc_fs.pc.base import WrapperPC, choice, text, told
 
 FEW_ROWS = 5000
 """Rows of mechanics per rank up to which blocks above the diagonal that couple it to one field are copied into one
@@ -129,6 +129,7 @@ class ContactTransform(WrapperPC):
         self._products = tuple(made)
         return S
 
+    @told
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Y = Q_r P^-1 x (right) or P^-1 Q_l x (left). Collective."""
         if self.side == "left":

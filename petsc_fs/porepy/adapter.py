@@ -1,3 +1,4 @@
+# mypy: disable-error-code="import-untyped"
 """From a PorePy model to a scene, and from a solution per field back to PorePy's order.
 
 The equation system of the model is asked which unknown and which equation lives on which grid;
@@ -13,12 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 import petsc_fs
+from petsc_fs.csr import CSR
 from petsc_fs.errors import LayoutError, SceneError
 from petsc_fs.fields import FIELD, in_order
 from petsc_fs.porepy import require_porepy
 from petsc_fs.scene import Material, Metadata, Scene
 
 pp = require_porepy()
+
+from scipy.sparse import csr_matrix  # noqa: E402
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -70,6 +74,7 @@ class Adapter:
             raise SceneError("the model has no equation system yet: call model.prepare_simulation() first")
         self.model = model
         self._structure: Any = None
+        self._cut = _Cut()
         self._refresh()
 
     @property
@@ -112,24 +117,12 @@ class Adapter:
         matrix = matrix.tocsr()  # of the model itself if it is in rows already: without zeros the same matrix
         if (matrix.data == 0).any():
             matrix.eliminate_zeros()
-        try:
-            return self._cut(matrix, rhs)
-        except LayoutError:
-            entries = matrix.nnz
-            matrix.sum_duplicates()  # takes as long as all else, and PorePy's matrices have none
-            if matrix.nnz == entries:
-                raise
-            return self._cut(matrix, rhs)
-
-    def _cut(self, matrix: Any, rhs: Floats) -> Scene:
-        """The scene of a matrix in compressed rows, and what else the model knows."""
-        model, cells = self.model, {f: self._grids[f] for f in self._rows}
-        return Scene.from_matrix(
-            matrix,
-            rhs,
-            self._rows,
-            columns=self._columns,
+        rhs, cells = np.asarray(rhs, dtype=np.float64), {f: self._grids[f] for f in self._rows}
+        scene = Scene(
             dimension=model.nd,
+            sizes={f: rows.size for f, rows in self._rows.items()},
+            blocks=self._cut.blocks(matrix, self._rows, self._columns),
+            rhs={f: rhs[rows] for f, rows in self._rows.items()},
             cell_centers={f: np.concatenate([g.cell_centers.T for g in gs]) for f, gs in cells.items()},
             cell_volumes={f: np.concatenate([g.cell_volumes for g in gs]) for f, gs in cells.items()},
             cell_dimension=_dimensions(cells["mass"]) if "mass" in cells else None,
@@ -137,6 +130,9 @@ class Adapter:
             material=self._material() if "mass" in cells else None,
             metadata=self._metadata(),
         )
+        if not (np.isfinite(matrix.data).all() and np.isfinite(rhs).all()):
+            scene.validate()  # names row and field; what else it looks at is right by construction
+        return scene
 
     def to_porepy(self, solution: Mapping[str, Floats]) -> Floats:
         """A vector of unknowns in PorePy's order, as `solve_linear_system` returns it.
@@ -296,6 +292,55 @@ class Adapter:
                 "petsc_fs": str(getattr(petsc_fs, "__version__", "unknown")),
             },
         )
+
+
+class _Cut:
+    """Cuts PorePy's matrix into blocks, and remembers where the entries of each are.
+
+    The rows of a field that have the pattern of the Newton step before, as those of momentum always do, are cut by one
+    copy of values per block.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[str, tuple[Any, Any, dict[str, CSR]]] = {}
+
+    def blocks(
+        self, matrix: Any, rows: Mapping[str, Indices], columns: Mapping[str, Indices]
+    ) -> dict[tuple[str, str], CSR]:
+        """The blocks that have entries, with increasing columns.
+
+        Args:
+            matrix: in compressed rows; entries given twice are summed, in place.
+            rows: per field those of the matrix.
+            columns: likewise.
+        """
+        found: dict[tuple[str, str], CSR] = {}
+        for r, index in rows.items():
+            own = _rows(matrix, index)
+            known = self._known.get(r)
+            if known is None or not all(map(np.array_equal, known[:2], own[:2])):
+                n = index.size, matrix.shape[1]
+                numbered = csr_matrix((np.arange(own.indices.size), own.indices, own.indptr), n)
+                parts = {c: numbered[:, index] for c, index in columns.items()}
+                for part in parts.values():
+                    part.sort_indices()
+                if not all(part.has_canonical_format for part in parts.values()):
+                    matrix.sum_duplicates()
+                    return self.blocks(matrix, rows, columns)
+                places = {c: CSR(p.indptr.astype(np.int64), p.indices, p.data) for c, p in parts.items() if p.nnz}
+                known = self._known[r] = own.indptr, own.indices.copy(), places
+            found |= {(r, c): CSR(at.indptr, at.indices, own.data[at.data]) for c, at in known[2].items()}
+        return found
+
+
+def _rows(matrix: Any, index: Indices) -> CSR:
+    """Some rows of a matrix; without a copy of entries where they follow each other."""
+    if index.size and (np.diff(index) == 1).all():
+        indptr = matrix.indptr[index[0] : index[-1] + 2]
+        entries = slice(indptr[0], indptr[-1])
+        return CSR(indptr - indptr[0], matrix.indices[entries], matrix.data[entries])
+    own = matrix[index]
+    return CSR(own.indptr, own.indices, own.data)
 
 
 def scene_from_model(model: Any) -> Scene:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,27 +25,12 @@ from petsc_fs.scene import Scene, contact_state_counts
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from petsc_fs.porepy.adapter import Adapter
-
 SOLVERS = ("direct", "fieldsplit")
 """How a run gets from one Newton step to the next: by an accurate direct solver, for small models, or as
 `petsc_fs.porepy.FieldSplitSolver` does by default."""
 
 Floats = NDArray[np.float64]
 Progress = Callable[[str], None]
-
-BUNDLED = {
-    "model1": (2.0, "mixed@6"),
-    "model2": (2.0, "3:2"),
-    "model3": (0.25, "2:1"),
-    "biot": (2.0, "1:0"),
-    "flow": (2.0, "1:0"),
-    "contact": (2.0, "4:1"),
-}
-"""Refinement and Newton step (see `Steps.parse`) of each scene that comes with the package."""
-
-BUNDLED_SEQUENCES = {"model2_run": ("model2", 1.0, 1)}
-"""Model, refinement and number of time steps of each sequence that comes with the package."""
 
 
 @dataclass(frozen=True)
@@ -92,81 +77,6 @@ class Steps:
         return cls(frozenset(numbers), "all" in words, "last" in words, mixed)
 
 
-class _Recorder:
-    """Takes scenes from a running model and writes them."""
-
-    def __init__(
-        self, steps: Steps, path: Callable[[int, int], Path], reference: bool, progress: Progress | None
-    ) -> None:
-        self.steps = steps
-        self.path = path
-        self.reference = reference
-        self.progress = progress
-        self.written: list[Path] = []
-        self.pending = set(steps.numbers)
-        self.mixed_pending = steps.mixed > 0
-        self.latest: tuple[Scene, Floats | None] | None = None
-        self.adapter: Adapter | None = None
-
-    def __call__(self, model: Any, solution: Floats | None) -> None:
-        """Look at one Newton step; ends the run when nothing is left to write."""
-        from petsc_fs.porepy.adapter import Adapter
-        from petsc_fs.porepy.models import StopRun
-
-        if self.adapter is None:
-            self.adapter = Adapter(model)
-        step = (model.time_manager.time_index, model.nonlinear_solver_statistics.num_iteration)
-        if self.pending and step > max(self.pending) and not (self.steps.every or self.steps.last):
-            self._check_found()
-        scene = self.adapter.scene()
-        states = {} if scene.contact_state is None else contact_state_counts(scene.contact_state)
-        if self.progress is not None:
-            self.progress(_step_text(scene))
-        mixed = bool(states) and all(states.values()) and step[0] >= self.steps.mixed
-        if self.steps.every or step in self.pending or (self.mixed_pending and mixed):
-            self._write(scene, solution)
-        self.mixed_pending = self.mixed_pending and not mixed
-        self.pending.discard(step)
-        if self.steps.last:
-            self.latest = (scene, solution)
-        if not (self.steps.every or self.steps.last or self.mixed_pending or self.pending):
-            raise StopRun
-
-    def finish(self) -> list[Path]:
-        """Write the last step if asked for; all paths written."""
-        if self.latest is not None:
-            self._write(*self.latest)
-        self._check_found()
-        return self.written
-
-    def _check_found(self) -> None:
-        if self.pending:
-            missing = ", ".join(f"{t}:{n}" for t, n in sorted(self.pending))
-            raise UsageError(f"steps: the run has no Newton step {missing}")
-        if self.mixed_pending:
-            raise UsageError("steps: no Newton step of the run has sticking, sliding and open cells at once")
-
-    def _write(self, scene: Scene, solution: Floats | None) -> None:
-        from petsc_fs.io import hdf5
-
-        path = self.path(scene.metadata.time_step_index, scene.metadata.newton_index)
-        if path in self.written:
-            return
-        if solution is not None:
-            assert self.adapter is not None
-            scene.reference = self.adapter.from_porepy(solution)
-        self.written.append(hdf5.write(scene, path))
-        if self.progress is not None:
-            self.progress(f"wrote {path}")
-
-
-def _step_text(scene: Scene) -> str:
-    """One line on a Newton step."""
-    states = {} if scene.contact_state is None else contact_state_counts(scene.contact_state)
-    text = ", ".join(f"{n} {state}" for state, n in states.items()) or "no contact"
-    return f"time step {scene.metadata.time_step_index}, Newton step {scene.metadata.newton_index}: {text}"
-
-
 def export(
     model_name: str,
     refinement: float = 1.0,
@@ -200,28 +110,61 @@ def export(
         SolveError: Newton did not converge.
         SceneError: a file cannot be written.
     """
+    from petsc_fs.io import hdf5
+
     if reference and solver != "direct":
         raise UsageError("a reference solution is that of the direct solver; leave the solver at direct")
     chosen = Steps.parse(steps) if isinstance(steps, str) else steps
     settings = parameters if parameters is not None else ModelParameters(refinement=refinement)
-    model, solve = _prepare(model_name, settings, solver)
+    run = _Run(model_name, settings, solver)
     target = _folder(Path(directory))
+    say = progress or (lambda line: None)
+    pending, mixed_pending = set(chosen.numbers), chosen.mixed > 0
+    latest: Scene | None = None
+    written: list[Path] = []
 
-    def path(time_step: int, newton: int) -> Path:
-        return target / f"{model_name}_g{settings.refinement:g}_t{time_step}_n{newton}.h5"
+    def check_found() -> None:
+        if pending:
+            missing = ", ".join(f"{t}:{n}" for t, n in sorted(pending))
+            raise UsageError(f"steps: the run has no Newton step {missing}")
+        if mixed_pending:
+            raise UsageError("steps: no Newton step of the run has sticking, sliding and open cells at once")
 
-    recorder = _Recorder(chosen, path, reference, progress)
+    def write(scene: Scene) -> None:
+        meta = scene.metadata
+        name = f"{model_name}_g{settings.refinement:g}_t{meta.time_step_index}_n{meta.newton_index}.h5"
+        if target / name not in written:
+            written.append(hdf5.write(scene, target / name))
+            say(f"wrote {written[-1]}")
 
-    def advance(model: Any) -> Floats:
-        if not reference:
-            recorder(model, None)  # before solving: the last scene of a run needs no solution
-        solution = solve(model)
+    def look(scene: Scene) -> bool:
+        """Write a scene if it is wanted; whether nothing is left to write."""
+        nonlocal mixed_pending, latest
+        step = scene.metadata.time_step_index, scene.metadata.newton_index
+        if pending and step > max(pending) and not (chosen.every or chosen.last):
+            check_found()
+        say(_step_text(scene))
+        states = {} if scene.contact_state is None else contact_state_counts(scene.contact_state)
+        mixed = bool(states) and all(states.values()) and step[0] >= chosen.mixed
+        if chosen.every or step in pending or (mixed_pending and mixed):
+            write(scene)
+        mixed_pending = mixed_pending and not mixed
+        pending.discard(step)
+        latest = scene if chosen.last else None
+        return not (chosen.every or chosen.last or mixed_pending or pending)
+
+    def advance(scene: Scene) -> Floats | None:
+        solution = None
         if reference:
-            recorder(model, solution)
-        return solution
+            solution = run.solve()
+            scene.reference = run.adapter.from_porepy(solution)
+        return None if look(scene) else run.solve() if solution is None else solution
 
-    _run(model, advance, time_steps)
-    return recorder.finish()
+    run.go(advance, time_steps)
+    if latest is not None:
+        write(latest)
+    check_found()
+    return written
 
 
 def export_sequence(
@@ -250,26 +193,20 @@ def export_sequence(
     """
     from petsc_fs.io import sequence
 
-    model, solve = _prepare(model_name, parameters or ModelParameters(), solver)
+    run = _Run(model_name, parameters or ModelParameters(), solver)
     target = Path(path)
     _folder(target.parent)
-    writer = sequence.Writer(target, model=model.scene_name)
+    writer = sequence.Writer(target, model=run.model.scene_name)
     say = progress or (lambda line: None)
-    adapters: list[Adapter] = []
 
-    def advance(model: Any) -> Floats:
-        from petsc_fs.porepy.adapter import Adapter
-
-        if not adapters:
-            adapters.append(Adapter(model))
-        scene = adapters[0].scene()
-        solution = solve(model)
-        writer.append(scene, run_attributes(model))
+    def advance(scene: Scene) -> Floats:
+        solution = run.solve()
+        writer.append(scene, run_attributes(run.model))
         say(f"step {writer.steps - 1}: {_step_text(scene)}")
         return solution
 
     try:
-        _run(model, advance, time_steps)
+        run.go(advance, time_steps)
     except BaseException:
         if kept := writer.abandon():
             say(f"the run did not end; {kept} has its first {writer.steps} Newton steps")
@@ -289,38 +226,56 @@ def run_attributes(model: Any) -> dict[str, Any]:
     return {name: getattr(last, name) for name in names} | inexact
 
 
-def _prepare(model_name: str, parameters: ModelParameters, solver: str) -> tuple[Any, Callable[[Any], Floats]]:
-    """The model, and what takes it from one Newton step to the next.
+class _Run:
+    """A model, and what takes it from one Newton step to the next.
 
     Raises:
         UsageError: there is no such model or solver, or PorePy is missing.
     """
-    find_case(model_name)
-    if solver not in SOLVERS:
-        raise UsageError(f"solver {solver!r}: expected {' or '.join(SOLVERS)}")
-    require_porepy()
-    from petsc_fs.porepy.direct import solve
-    from petsc_fs.porepy.lean_model import LeanModel
-    from petsc_fs.porepy.models import make_model
-    from petsc_fs.porepy.solver import FieldSplitSolver
 
-    if solver == "direct":
-        model = make_model(model_name, parameters, mixins=(LeanModel,))
-        return model, lambda model: solve(*model.linear_system)
-    model = make_model(model_name, parameters, mixins=(FieldSplitSolver, LeanModel))
-    return model, FieldSplitSolver.solve_linear_system
+    def __init__(self, model_name: str, parameters: ModelParameters, solver: str) -> None:
+        find_case(model_name)
+        if solver not in SOLVERS:
+            raise UsageError(f"solver {solver!r}: expected {' or '.join(SOLVERS)}")
+        require_porepy()
+        from petsc_fs.porepy import direct
+        from petsc_fs.porepy.models import make_model
+        from petsc_fs.porepy.solver import FieldSplitSolver
+
+        mixins = (FieldSplitSolver,) if solver == "fieldsplit" else ()
+        self.model = make_model(model_name, parameters, mixins=mixins)
+        self._solve: Callable[[Any], Floats] = FieldSplitSolver.solve_linear_system
+        if not mixins:
+            self._solve = lambda model: direct.solve(*model.linear_system)
+
+    def solve(self) -> Floats:
+        """The Newton update."""
+        return self._solve(self.model)
+
+    def go(self, advance: Callable[[Scene], Floats | None], time_steps: int | None) -> None:
+        """Run to the end, or of some time steps, or until what is called with each scene returns no update."""
+        from petsc_fs.porepy.adapter import Adapter
+        from petsc_fs.porepy.models import StopRun, run
+
+        self.model.prepare_simulation()
+        self.adapter = Adapter(self.model)
+
+        def linear_solve(model: Any) -> Floats:
+            if time_steps is not None and model.time_manager.time_index > time_steps:
+                raise StopRun
+            update = advance(self.adapter.scene())
+            if update is None:
+                raise StopRun
+            return update
+
+        run(self.model, linear_solve=linear_solve)
 
 
-def _run(model: Any, advance: Callable[[Any], Floats], time_steps: int | None) -> None:
-    """Run a model to its end, or to the end of some time steps."""
-    from petsc_fs.porepy.models import StopRun, run
-
-    def limited(model: Any) -> Floats:
-        if time_steps is not None and model.time_manager.time_index > time_steps:
-            raise StopRun
-        return advance(model)
-
-    run(model, linear_solve=limited)
+def _step_text(scene: Scene) -> str:
+    """One line on a Newton step."""
+    states = {} if scene.contact_state is None else contact_state_counts(scene.contact_state)
+    text = ", ".join(f"{n} {state}" for state, n in states.items()) or "no contact"
+    return f"time step {scene.metadata.time_step_index}, Newton step {scene.metadata.newton_index}: {text}"
 
 
 def _folder(path: Path) -> Path:
@@ -330,55 +285,6 @@ def _folder(path: Path) -> Path:
     except OSError as e:
         raise SceneError(f"{path}: cannot be made a directory: {e.strerror}") from e
     return path
-
-
-def export_bundled(
-    directory: str | os.PathLike[str], names: Iterable[str] = BUNDLED, progress: Progress | None = None
-) -> list[Path]:
-    """Make the scenes that come with the package, `NAME.h5`, with reference solutions.
-
-    Args:
-        directory: where the files go; made if missing.
-        names: which of `BUNDLED`.
-        progress: see `export`.
-
-    Raises:
-        PetscFsError: see `export`.
-    """
-    target = Path(directory)
-    made = []
-    for name in names:
-        if name not in BUNDLED:
-            raise UsageError(f"no bundled scene {name!r}; there are {', '.join(BUNDLED)}")
-        refinement, steps = BUNDLED[name]
-        if progress is not None:
-            progress(f"{name}, refinement {refinement:g}:")
-        (path,) = export(name, refinement, target, steps=steps, reference=True, progress=progress)
-        made.append(path.replace(target / f"{name}.h5"))
-    return made
-
-
-def export_bundled_sequences(directory: str | os.PathLike[str], progress: Progress | None = None) -> list[Path]:
-    """Make the sequences that come with the package, `NAME.h5`, by `FieldSplitSolver` on one rank.
-
-    Args:
-        directory: where the files go; made if missing.
-        progress: see `export`.
-
-    Raises:
-        PetscFsError: see `export`.
-    """
-    return [
-        export_sequence(
-            model,
-            Path(directory) / f"{name}.h5",
-            parameters=ModelParameters(refinement=refinement),
-            time_steps=time_steps,
-            solver="fieldsplit",
-            progress=progress,
-        )
-        for name, (model, refinement, time_steps) in BUNDLED_SEQUENCES.items()
-    ]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

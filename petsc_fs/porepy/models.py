@@ -62,28 +62,6 @@ class ConstraintLineSearch(
     """Newton with a line search on the residual and on the contact constraints."""
 
 
-class Hooks(pp.SolutionStrategy):
-    """A linear solve that can be replaced, and a call after each linear solve.
-
-    Attributes:
-        linear_solve: given the model, solves `model.linear_system`; None for PorePy's own solver.
-        newton_hooks: called with the model and the Newton update, before the update is applied.
-    """
-
-    linear_solve: LinearSolve | None = None
-    newton_hooks: tuple[NewtonHook, ...] = ()
-
-    def solve_linear_system(self) -> Floats:
-        """Solve, then tell the hooks."""
-        if self.linear_solve is not None:
-            update = self.linear_solve(self)
-        else:
-            update = super().solve_linear_system()
-        for hook in self.newton_hooks:
-            hook(self, update)
-        return update
-
-
 class NoFiles(pp.SolutionStrategy):
     """Keep PorePy from writing into the working directory."""
 
@@ -355,7 +333,7 @@ def make_model(
     elif changes:
         raise UsageError("make_model: give either `parameters` or keyword arguments")
     own = CLASSES[case.equations]
-    cls = type(own.__name__, (Hooks, *mixins, own), {})
+    cls = type(own.__name__, (*mixins, own), {})
     changed = parameters.changes()
     end = case.time_step * case.time_steps
     model = cls(
@@ -427,15 +405,20 @@ def run(
 
 @contextmanager
 def _hooked(model: Any, hook: NewtonHook | None, linear_solve: LinearSolve | None) -> Iterator[None]:
-    before = model.newton_hooks, model.linear_solve
-    if hook is not None:
-        model.newton_hooks = (*model.newton_hooks, hook)
-    if linear_solve is not None:
-        model.linear_solve = linear_solve
+    """Have a model solve its linear systems in another way, and tell a hook, within a block."""
+    solve = linear_solve or type(model).solve_linear_system
+
+    def solve_linear_system() -> Floats:
+        update: Floats = solve(model)
+        if hook is not None:
+            hook(model, update)
+        return update
+
+    model.solve_linear_system = solve_linear_system
     try:
         yield
     finally:
-        model.newton_hooks, model.linear_solve = before
+        del model.solve_linear_system
 
 
 def _pressure_ratio(case: Case, parameters: ModelParameters) -> float:

@@ -11,9 +11,11 @@ import json
 import math
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -22,14 +24,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from petsc_fs import options
-from petsc_fs.errors import PetscFsError, SolveError, UsageError, together
+from petsc_fs import options, server
+from petsc_fs.errors import PetscFsError, SolveError, UsageError, portable, together
 from petsc_fs.io.bundled import versions
 from petsc_fs.io.files import write_text
 from petsc_fs.porepy import require_porepy
 from petsc_fs.porepy.cases import CASES, ModelParameters
-from petsc_fs.porepy.export import add_model_arguments, parameters_of, run_attributes
-from petsc_fs.porepy.observation import PHASES, Observed, Observer
+from petsc_fs.porepy.export import add_model_arguments, parameters_of, run_attributes, write_to_stderr
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -37,12 +38,13 @@ if TYPE_CHECKING:
     from petsc_fs.io.sequence import Writer
 
 Floats = NDArray[np.float64]
+Record = dict[str, Any]
 
 RECORDS, SUMMARY, PICTURE, SEQUENCE, VTU = "solves.jsonl", "summary.json", "contact_states", "sequence.h5", "vtu"
 """Names of what a run writes."""
 
-SECONDS_BETWEEN_PICTURES = 30.0
-"""The picture is drawn after the first time step, and again after a later one when so much time has gone by."""
+PHASES = ("meshing", "discretisation", "assembly", "transfer", "setup", "solve", "output")
+"""Where the seconds of a run go. What is left is PorePy's own: residuals, line search and bookkeeping."""
 
 PICTURES = ("png", "svg", "pdf", "none")
 
@@ -81,6 +83,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
     """Run what the arguments of `add_arguments` ask for; progress goes to stderr. Collective.
 
+    On rank 0 `args.summary` then is what the run took.
+
     Raises:
         UsageError: PorePy is missing, there is no such model or parameter, or an option did nothing.
         SolveError: Newton did not converge, or a linear solve failed.
@@ -101,20 +105,22 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
             require_porepy()
             _make_folder(folder)
     given.start(files=False)
-    outcome = None
     error: BaseException | None = None
     with _terminate_as_interrupt(comm.rank):
-        client = _start_server(comm)
+        client = server.start(comm) if comm.size > 1 else None
         if comm.rank == 0:
             try:
-                outcome = _Run(args, parameters, folder, given, comm.size).go()
+                file = given.files[0] if given.files else None
+                args.summary = Simulation(args, parameters, folder, file, comm.size).go()
             except BaseException as e:
                 error = e
             finally:
                 if client is not None:
                     client.stop()
-        _raise_together(error, comm)
-    args.summary = outcome
+        sent = error if error is None or isinstance(error, KeyboardInterrupt) else portable(error)
+        other = comm.bcast(sent)
+    if other is not None:
+        raise error or other
     return 0
 
 
@@ -139,75 +145,55 @@ def _terminate_as_interrupt(rank: int) -> Iterator[None]:
         signal.signal(signal.SIGINT, before_interrupt if before_interrupt is not None else signal.default_int_handler)
 
 
-def _start_server(comm: MPI.Intracomm) -> Any:
-    """Let the other ranks serve this one; they come back when it says stop. Collective."""
-    if comm.size == 1:
-        return None
-    from petsc_fs import server
+class Simulation:
+    """One run on rank 0, and what it leaves in its folder.
 
-    return server.start(comm)
+    Records are written one JSON object a line, each as soon as its Newton step is judged, so that a run that is
+    interrupted keeps what it has.
 
-
-def _raise_together(error: BaseException | None, comm: MPI.Intracomm) -> None:
-    """Raise the error of rank 0 on all ranks. Collective."""
-    kind = None
-    if error is not None:
-        kind = "interrupt" if isinstance(error, KeyboardInterrupt) else "error"
-    kind, text = comm.bcast((kind, str(error)))
-    if kind == "interrupt":
-        raise error if error is not None else KeyboardInterrupt(text)
-    if kind == "error":
-        own = comm.bcast(error if isinstance(error, PetscFsError) else None)
-        raise error or own or RuntimeError(text)
-
-
-class _Run:
-    """One run on rank 0, and what it leaves in its folder."""
+    Attributes:
+        records: what is in the file; see `petsc_fs.porepy.solver.LinearSolve` for most of their entries.
+        seconds: per phase.
+        time_steps: number of time steps that converged.
+        cuts: number of time steps that were tried again with a shorter step.
+    """
 
     def __init__(
-        self, args: argparse.Namespace, parameters: ModelParameters, folder: Path, given: options.Given, ranks: int
+        self, args: argparse.Namespace, parameters: ModelParameters, folder: Path, file: Path | None, ranks: int
     ) -> None:
-        from petsc_fs.porepy.display import display_for
-
-        self.args = args
-        self.parameters = parameters
-        self.folder = folder
-        self.given = given
-        self.ranks = ranks
+        self.args, self.parameters, self.folder, self.file, self.ranks = args, parameters, folder, file, ranks
+        self.records: list[Record] = []
+        self.seconds = dict.fromkeys(PHASES, 0.0)
+        self.time_steps = self.cuts = 0
         self.files: list[str] = [RECORDS]
         self.notes: list[str] = []
-        self.name = args.model
-        self.display = display_for(args.model)
-        self.writer: Writer | None = None
-        self._drawn = -math.inf
         self.model: Any = None
+        self.name = args.model
+        self.writer: Writer | None = None
+        self._started = time.perf_counter()
+        self._phase: str | None = None
+        self._counted = dict(self.seconds)
+        self._pending: Record | None = None
         for name in (RECORDS, SUMMARY, SEQUENCE, *(f"{PICTURE}.{suffix}" for suffix in PICTURES[:-1])):
             (folder / name).unlink(missing_ok=True)  # of an earlier run
-        self.observer = Observer(
-            folder / RECORDS,
-            time_steps=args.time_steps,
-            on_record=self.display.show,
-            on_time_step=self._end_time_step,
-            on_solve=self._solve,
-        )
+        (folder / RECORDS).touch()
 
     def go(self) -> dict[str, Any]:
         """Run to the end, and write everything; what is in the summary."""
         result = "finished"
         error: BaseException | None = None
         try:
-            with self.display:
-                self._simulate()
+            self._simulate()
         except KeyboardInterrupt as e:
             result, error = "interrupted", e
         except BaseException as e:
             result, error = "failed", e
             raise
         finally:
-            self.observer.close()
+            self._flush()
             summary = self._finish(result, error)
         if error is not None:
-            kept = f"{len(self.observer.records)} solves in {summary['time_steps']} complete time steps"
+            kept = f"{len(self.records)} solves in {summary['time_steps']} complete time steps"
             raise KeyboardInterrupt(f"interrupted; {self.folder} keeps {kept}") from error
         return summary
 
@@ -215,46 +201,89 @@ class _Run:
         runner: Callable[[], None]
         self.model, runner = _prepare_model(self.args.model, self.parameters, self.folder, self.args.vtu)
         self.name = getattr(self.model, "scene_name", type(self.model).__name__)
-        self.model.observer = self.observer
-        if self.given.files:
-            self.model.params["petsc_fs_options_file"] = str(self.given.files[0])
+        self.model.simulation = self
+        if self.file is not None:
+            self.model.params["petsc_fs_options_file"] = str(self.file)
         if self.args.sequence:
             from petsc_fs.io import sequence
 
             self.writer = sequence.Writer(self.folder / SEQUENCE, model=self.name)
-        self.display.begin(_expected_time_steps(self.model, self.args.time_steps))
         runner()
 
-    def _solve(self, model: Any, solve: Callable[[], Floats]) -> Floats:
-        scene = None
+    # What the model tells, see `Observed`
+
+    @contextmanager
+    def phase(self, name: str) -> Iterator[None]:
+        """Count the time of a block; a block within a block counts for the outer one."""
+        if self._phase is not None:
+            yield
+            return
+        self._phase = name
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._phase = None
+            self.seconds[name] += time.perf_counter() - started
+
+    def end_solve(self, model: Any) -> None:
+        """Begin the record of a linear solve."""
+        last = model.linear_solves[-1]
+        for name in ("transfer", "setup", "solve"):
+            self.seconds[name] += getattr(last, f"{name}_seconds")
+        self._pending = asdict(last) | {
+            "time": float(model.time_manager.time),
+            "time_step_length": float(model.time_manager.dt),
+            **{f"{n}_seconds": self.seconds[n] - self._counted[n] for n in ("discretisation", "assembly")},
+        }
+        self._counted = dict(self.seconds)
         if self.writer is not None:
             from petsc_fs.porepy.adapter import scene_from_model
 
-            scene = scene_from_model(model)
-        update = solve()
-        if not self.observer.records:
-            from mpi4py import MPI
+            with self.phase("output"):
+                self.writer.append(scene_from_model(model), run_attributes(model))
 
-            warning = self.given.judge(MPI.COMM_SELF)
-            if warning:
-                print(f"petsc-fs: warning: {warning}", file=sys.stderr)
-        if self.writer is not None and scene is not None:
-            with self.observer.phase("output"):
-                self.writer.append(scene, run_attributes(model))
-        return update
+    def end_newton_step(self, model: Any, converged: bool) -> None:
+        """Complete the record of a Newton step with what PorePy's convergence check has found."""
+        if self._pending is not None:
+            found = model.nonlinear_solver_statistics
+            norms = {"increment": found.nonlinear_increment_norms, "residual": found.residual_norms}
+            self._pending |= {f"newton_{name}": values[-1] if values else None for name, values in norms.items()}
+            self._pending["newton_converged"] = bool(converged)
+            self._flush()
 
-    def _end_time_step(self, number: int) -> None:
-        self.display.advance(number)
-        if time.monotonic() - self._drawn > SECONDS_BETWEEN_PICTURES:
-            with self.observer.phase("output"):
-                self._draw()
+    def end_time_step(self) -> bool:
+        """Count a time step that converged; whether the run has to end with it."""
+        self.time_steps += 1
+        return self.args.time_steps is not None and self.time_steps >= self.args.time_steps
+
+    def _flush(self) -> None:
+        """Write a record that waits for its Newton step to be judged."""
+        if self._pending is None:
+            return
+        record: Record = {n: _finite(v) if isinstance(v, float) else v for n, v in self._pending.items()}
+        self._pending = None
+        self.records.append(record)
+        with (self.folder / RECORDS).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(record, allow_nan=False) + "\n")
+        parts = [
+            f"time step {record['time_step']} of {_expected_time_steps(self.model, self.args.time_steps)}, "
+            f"Newton step {record['newton_index']}: {record['iterations']} Krylov iterations"
+            + ("" if record["converged"] else " (NOT CONVERGED)"),
+            f"residual {record['newton_residual']:.1e}" if record.get("newton_residual") is not None else "",
+            ", ".join(f"{n} {state}" for state, n in record["contact_states"].items()),
+        ]
+        write_to_stderr("; ".join(filter(None, parts)))
+
+    # What is left of the run
 
     def _finish(self, result: str, error: BaseException | None) -> dict[str, Any]:
         """Complete the sequence, draw the picture and write the summary; none of it hides an error of the run."""
         try:
             if self.writer is not None:
-                self._finish_sequence(result)
-            if self.args.vtu and (self.folder / VTU).is_dir():
+                kept = self.writer.finish() if result == "finished" else self.writer.abandon()
+                self.files += [kept.name] if kept is not None else []
+            if (self.folder / VTU).is_dir() and self.args.vtu:
                 self.files.append(VTU)
             if result != "interrupted":  # then there may be no time: MPI launchers kill after a second
                 self._draw()
@@ -266,52 +295,102 @@ class _Run:
             summary = self._summary(result, error)
         return summary
 
-    def _finish_sequence(self, result: str) -> None:
-        assert self.writer is not None
-        kept = self.writer.finish() if result == "finished" else self.writer.abandon()
-        if kept is not None:
-            self.files.append(kept.name)
-
     def _draw(self) -> None:
-        """Draw the contact states so far, if there are any."""
+        """Draw the contact states, if there are any."""
         from petsc_fs.tools.plots import plot_contact_states
 
-        self._drawn = time.monotonic()
-        if self.args.picture == "none" or self.notes or not any(r["contact_states"] for r in self.observer.records):
+        if self.args.picture == "none" or not any(r["contact_states"] for r in self.records):
             return
         target = self.folder / f"{PICTURE}.{self.args.picture}"
         try:
-            plot_contact_states(self.observer.records, target, title=self.name, cells=_fracture_cells(self.model))
-            if target.name not in self.files:
-                self.files.append(target.name)
+            with self.phase("output"):
+                plot_contact_states(self.records, target, title=self.name, cells=_fracture_cells(self.model))
+            self.files.append(target.name)
         except UsageError as e:  # no matplotlib
             self.notes.append(f"no picture of the contact states: {e}")
 
     def _summary(self, result: str, error: BaseException | None) -> dict[str, Any]:
-        observer, records = self.observer, self.observer.records
-        total = observer.total_seconds
-        seconds = {name: observer.seconds[name] for name in PHASES}
-        porepy = require_porepy()
+        total, records = time.perf_counter() - self._started, self.records
         return {
             "model": self.name,
             "result": result,
             "message": None if error is None else str(error) or type(error).__name__,
             "ranks": self.ranks,
             "unknowns": records[-1]["unknowns"] if records else None,
-            "time_steps": observer.time_steps,
-            "time_step_cuts": observer.cuts,
+            "time_steps": self.time_steps,
+            "time_step_cuts": self.cuts,
             "newton_steps": len(records),
             "iterations": sum(r["iterations"] for r in records),
             "not_converged": sum(not r["converged"] for r in records),
             "contact_states": records[-1]["contact_states"] if records else {},
-            "seconds": {**seconds, "other": max(total - sum(seconds.values()), 0.0), "total": total},
+            "seconds": {**self.seconds, "other": max(total - sum(self.seconds.values()), 0.0), "total": total},
             "folder": str(self.folder),
             "files": [*self.files, SUMMARY],
             "notes": self.notes,
-            "options_file": self.given.files[0].name if self.given.files else None,
+            "options_file": None if self.file is None else self.file.name,
             "options": options.database(),
-            "versions": {**versions(), "porepy": str(porepy.__version__)},
+            "versions": {**versions(), "porepy": str(require_porepy().__version__)},
         }
+
+
+def _timed(name: str, phase: str) -> Any:
+    """A method that counts the time of that of the next class."""
+
+    def method(self: Any, *args: Any, **kwargs: Any) -> Any:
+        with self.simulation.phase(phase):
+            return getattr(super(Observed, self), name)(*args, **kwargs)
+
+    return method
+
+
+class Observed:
+    """Mixin that tells a `Simulation` what a model does; it goes before all other bases.
+
+    Attributes:
+        simulation: set it before the model is prepared.
+        stop: raised to end the run after the last time step asked for.
+    """
+
+    simulation: Simulation
+    stop: type[Exception]
+
+    set_discretization_parameters = _timed("set_discretization_parameters", "discretisation")
+    discretize = _timed("discretize", "discretisation")
+    rediscretize = _timed("rediscretize", "discretisation")
+    assemble_linear_system = _timed("assemble_linear_system", "assembly")
+    save_data_time_step = _timed("save_data_time_step", "output")
+
+    def set_geometry(self) -> None:
+        """Mesh."""
+        handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        with self.simulation.phase("meshing"):
+            super().set_geometry()  # type: ignore[misc]
+        if threading.current_thread() is threading.main_thread():
+            for number, handler in handlers.items():  # gmsh leaves some that end the process at once
+                signal.signal(number, handler if handler is not None else signal.SIG_DFL)
+
+    def solve_linear_system(self) -> Floats:
+        """Solve, by the next class that does."""
+        update: Floats = super().solve_linear_system()  # type: ignore[misc]
+        self.simulation.end_solve(self)
+        return update
+
+    def check_convergence(self, *args: Any, **kwargs: Any) -> tuple[bool, bool]:
+        """Look at the Newton step."""
+        converged, diverged = super().check_convergence(*args, **kwargs)  # type: ignore[misc]
+        self.simulation.end_newton_step(self, converged)
+        return converged, diverged
+
+    def after_nonlinear_convergence(self) -> None:
+        """End a time step, and perhaps the run."""
+        super().after_nonlinear_convergence()  # type: ignore[misc]
+        if self.simulation.end_time_step():
+            raise self.stop
+
+    def after_nonlinear_failure(self) -> None:
+        """Try again with a shorter time step, where the model does that."""
+        super().after_nonlinear_failure()  # type: ignore[misc]
+        self.simulation.cuts += 1
 
 
 def _prepare_model(name: str, parameters: ModelParameters, folder: Path, vtu: bool) -> tuple[Any, Callable[[], None]]:
@@ -431,3 +510,8 @@ def _make_folder(folder: Path) -> None:
         probe.unlink()
     except OSError as e:
         raise UsageError(f"{folder}: cannot be written to: {e.strerror}") from e
+
+
+def _finite(value: float) -> float | None:
+    """A number as JSON has it: None for NaN and infinity."""
+    return float(value) if math.isfinite(value) else None

@@ -7,16 +7,18 @@
     print(sum(solve.iterations for solve in model.linear_solves))
 
 Started with `mpiexec -n 4 python script.py`, rank 0 runs PorePy and the script, and the other ranks help to solve.
-PorePy itself is not imported here.
 """
 
 from __future__ import annotations
 
 import logging
 import math
+import os
 import sys
 import time
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,16 +26,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petsc_fs import options, server
-from petsc_fs.errors import SceneError, SolveError, UsageError
-from petsc_fs.fields import in_order
+from petsc_fs.errors import LayoutError, SolveError, UsageError
 from petsc_fs.memory import return_freed
-from petsc_fs.options import Choice, Facts
 from petsc_fs.porepy.forcing import EisenstatWalker, EisenstatWalkerParameters
 from petsc_fs.scene import Scene, contact_state_counts
 
 if TYPE_CHECKING:
     from petsc_fs.porepy.adapter import Adapter
-    from petsc_fs.server import ServedSolver
     from petsc_fs.solver import Result
 
 Floats = NDArray[np.float64]
@@ -46,11 +45,14 @@ ON_FAILURE = ("accept", "retry", "raise")
 FORCING = ("fixed", "eisenstat_walker")
 """Values of -petsc_fs_forcing; the first is the default."""
 
-RETRY = "retry_"
-"""Prefix of the options of the second solve."""
-
 RETRY_FILE = "retry.opts"
-"""Options file of the second solve, if -petsc_fs_retry_file names no other."""
+"""-petsc_fs_retry where -petsc_fs_on_failure is retry."""
+
+FIRST = "first solve: "
+"""How the note of a solve that was tried again begins."""
+
+FOREIGN = ("temperature_variable", "enthalpy_variable")
+"""Attributes in which PorePy's models keep the names of unknowns that no field is for."""
 
 
 @dataclass(frozen=True)
@@ -69,10 +71,9 @@ class LinearSolve:
         forcing: relative tolerance that was asked for: -ksp_rtol, or the forcing term of inexact Newton.
         nonlinear_residual: norm of the residual, as Newton measures it, at the iterate that the system was
             assembled at.
-        action: "" if the solve converged at first; else what -petsc_fs_on_failure did: "accepted" (the update
-            was used as it is), "retried" (the numbers here are those of the second solve, the seconds of both)
-            or "raised" (the run ended).
-        failure: what went wrong at first, in words; "" if nothing.
+        action: "" if the solve converged at first; "retried" if it did by the options file of -petsc_fs_retry; else
+            what -petsc_fs_on_failure did: "accepted" (the update was used as it is) or "raised" (the run ended).
+        failure: what went wrong, at first where the solve was tried again, in words; "" if nothing.
         contact_states: number of sticking, sliding and open fracture cells at the iterate that the
             system was assembled at; empty without contact.
         rebuilds: how often, in this run so far, PETSc's objects were made anew because the sparsity had
@@ -104,19 +105,6 @@ class LinearSolve:
     rebuilds: int = 0
 
 
-@dataclass
-class _Outcome:
-    """A solve and what became of it."""
-
-    result: Result | None
-    action: str = ""
-    failure: str = ""
-    setup_seconds: float = 0.0
-    solve_seconds: float = 0.0
-    transfer_seconds: float = 0.0
-    error: SolveError | None = field(default=None, repr=False)
-
-
 class FieldSplitSolver:
     """Mixin that solves a model's linear systems on all ranks by what an options file says.
 
@@ -126,8 +114,8 @@ class FieldSplitSolver:
 
     From the model's parameters it takes:
 
-    - `petsc_fs_options_file`: path of the options file, or name of a shipped one; default is the smallest
-      solver for the fields and couplings of the model, cut from contact_poromechanics_fast.opts;
+    - `petsc_fs_options_file`: path of the options file, or name of a shipped one; default is the one for the
+      fields of the model;
     - `petsc_fs_options_prefix`: put before all option names, default "".
 
     The options of the file are in PETSc's database only while a system is being solved, and what
@@ -140,34 +128,53 @@ class FieldSplitSolver:
             to the logger "petsc_fs". accept uses the update all the same, as the paper did, as long as the linear
             residual is less than that of no update at all. It is the default: what Newton's method needs is a
             smaller residual, whether it got there it sees for itself, and a second solve by stronger means may not
-            fit into memory. retry solves again by another options file, and raises if that fails too.
-        -petsc_fs_retry_file FILE: for retry, default retry.opts; its options get the prefix retry_.
+            fit into memory. retry is -petsc_fs_retry retry.opts, and raises if that fails too.
         -petsc_fs_forcing fixed|eisenstat_walker: solve to -ksp_rtol, or each system only as far as Newton makes use
             of it, but never further than to -ksp_rtol; see `petsc_fs.porepy.forcing.EisenstatWalker`. Residuals are
             measured as Newton does, by the model's `compute_residual_norm`.
-        -petsc_fs_ew_rtol0, _rtolmax, _gamma, _alpha, _threshold: see `petsc_fs.porepy.forcing.EisenstatWalkerParameters`.
+        -petsc_fs_ew_rtol0, _rtolmax, _gamma, _alpha, _threshold: see
+            `petsc_fs.porepy.forcing.EisenstatWalkerParameters`.
 
     Attributes:
         linear_solves: one record per solve, in the order of solving.
+
+    Raises:
+        UsageError: of the class statement, where a base with a linear solver of PorePy's goes before this one.
+        LayoutError: of the construction, where the model is known to have an unknown that no field is for.
     """
 
     params: dict[str, Any]
     linear_system: tuple[Any, Floats]
     linear_solves: list[LinearSolve]
 
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        for base in cls.__mro__[: cls.__mro__.index(FieldSplitSolver)]:
+            if base.__module__.partition(".")[0] == "porepy" and "solve_linear_system" in vars(base):
+                raise UsageError(
+                    f"{cls.__name__}: FieldSplitSolver comes after {base.__name__}, whose linear solver would be used; "
+                    f"put it first: class {cls.__name__}(FieldSplitSolver, ...)"
+                )
+
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._client = server.join()
         return_freed()  # or the process grows with each Newton step: PorePy frees what malloc then keeps
         super().__init__(*args, **kwargs)
+        if unknown := [getattr(self, name) for name in FOREIGN if hasattr(self, name)]:
+            raise LayoutError(f"{type(self).__name__} has the unknown {', '.join(unknown)}, which is not supported")
         self.linear_solves = []
         self._adapter: Adapter | None = None
-        self._solver: ServedSolver | None = None
-        self._chosen: Choice | None = None
-        self._facts: Facts | None = None
+        self._solver: server.ServedSolver | None = None
+        self._file: Path | None = None
+        self._values: dict[str, str | None] = {}
         self._forcing: EisenstatWalker | None = None
         self._newton_tolerance: float | None = None
         self._reference_residual: Floats | None = None
-        self._earlier_rebuilds = 0
+
+    def discretize(self) -> None:
+        """PorePy's own, once it is clear that the model has no unknowns or equations but ours."""
+        self._prepare_adapter()
+        super().discretize()  # type: ignore[misc]
 
     def solve_linear_system(self) -> Floats:
         """The Newton update, in PorePy's order.
@@ -178,47 +185,49 @@ class FieldSplitSolver:
             UsageError: the options file cannot be used, or has an option that nothing asked for.
             SolveError: PETSc failed, the solution is not finite, or -petsc_fs_on_failure ends the run.
         """
-        from petsc_fs.porepy.adapter import Adapter
-
         started = time.perf_counter()
-        if self._adapter is None:
-            self._adapter = Adapter(self)
-        scene = self._adapter.scene()
+        scene = self._prepare_adapter().scene()
         cut_seconds = time.perf_counter() - started
-        chosen = self._choose(scene)
-        with options.inserted(chosen.values, self._options_prefix):
+        with self._options(scene):
+            policy = self._option("petsc_fs_on_failure", ON_FAILURE)
             residual = self._nonlinear_residual(scene)
-            outcome = self._solve_by_policy(scene, self._forcing_term(residual))
+            forcing = self._forcing_term(residual)
+            solver = self._updated_solver(scene)
+            result = solver.solve(forcing)
             if not self.linear_solves:
-                self._refuse_unused(chosen)
-        assert outcome.result is not None and self._client is not None
+                self._refuse_unused()
+        action, failure = self._judge(result, policy)
         back = time.perf_counter()
-        update = self._adapter.to_porepy(outcome.result.solution)
+        update = self._prepare_adapter().to_porepy(result.solution)
         states = scene.contact_state
         self.linear_solves.append(
             LinearSolve(
                 time_step=scene.metadata.time_step_index,
                 newton_index=scene.metadata.newton_index,
                 unknowns=update.size,
-                ranks=self._client.comm.size,
-                iterations=outcome.result.iterations,
-                reason=outcome.result.reason,
-                converged=outcome.result.converged,
-                true_relative_residual=outcome.result.true_relative_residual,
-                forcing=outcome.result.rtol,
+                ranks=1 if self._client is None else self._client.comm.size,
+                iterations=result.iterations,
+                reason=result.reason,
+                converged=result.converged,
+                true_relative_residual=result.true_relative_residual,
+                forcing=result.rtol,
                 nonlinear_residual=residual,
-                action=outcome.action,
-                failure=outcome.failure,
+                action=action,
+                failure=failure,
                 contact_states={} if states is None else contact_state_counts(states),
-                rebuilds=self._rebuilds,
+                rebuilds=solver.rebuilds,
                 seconds=time.perf_counter() - started,
-                transfer_seconds=cut_seconds + outcome.transfer_seconds + time.perf_counter() - back,
-                setup_seconds=outcome.setup_seconds,
-                solve_seconds=outcome.solve_seconds,
+                transfer_seconds=cut_seconds + solver.transfer_seconds + time.perf_counter() - back,
+                setup_seconds=result.setup_seconds,
+                solve_seconds=result.solve_seconds,
             )
         )
-        if outcome.error is not None:
-            raise outcome.error
+        if failure:
+            where = f"time step {scene.metadata.time_step_index}, Newton step {scene.metadata.newton_index}"
+            if action == "raised":
+                raise SolveError(f"{where}: {failure}")
+            so = "; the update is used all the same" if action == "accepted" else ""
+            logger.warning("%s: %s%s", where, failure, so)
         return update
 
     def check_convergence(self, *args: Any, **kwargs: Any) -> Any:
@@ -235,33 +244,32 @@ class FieldSplitSolver:
     def _options_prefix(self) -> str:
         return str(self.params.get("petsc_fs_options_prefix", ""))
 
-    def _choose(self, scene: Scene) -> Choice:
-        """The options of the file, or of the smallest tree for what the model has shown so far."""
+    @contextmanager
+    def _options(self, scene: Scene) -> Iterator[None]:
+        """Have the options of the file in the database within a block; without one the solver has its default."""
         name = self.params.get("petsc_fs_options_file")
-        if name is not None:
-            if self._chosen is None:
-                file = _fitting_file(str(name), scene)
-                self._chosen = Choice(options.parse(file), file, ())
-            return self._chosen
+        if name is not None and self._file is None:
+            self._file = options.fitting_file(str(name), scene.fields)
+            self._values = options.parse(self._file)
+        prefix = self._options_prefix
+        with options.inserted(self._values, prefix):
+            retries = self._option("petsc_fs_on_failure", ON_FAILURE) == "retry"
+            with options.inserted({"petsc_fs_retry": RETRY_FILE} if retries else {}, prefix):
+                yield
+
+    def _refuse_unused(self) -> None:
+        """Raise a UsageError if an option did nothing; those of PETSC_OPTIONS may be meant for other programs."""
         from petsc4py import PETSc
 
-        facts = Facts.of(scene, PETSc.COMM_SELF.tompi4py())
-        if self._facts is not None:
-            facts = facts.or_either(self._facts)
-        if self._chosen is None or facts != self._facts:
-            self._forget_solver()
-            self._chosen, self._facts = options.choose(facts), facts
-        return self._chosen
-
-    def _refuse_unused(self, chosen: Choice) -> None:
-        """Raise a UsageError if an option did nothing."""
-        retries = self._option("petsc_fs_on_failure", ON_FAILURE) == "retry"
-        later = f"{self._options_prefix}{RETRY}"
-        useless = [n for n in options.refused(options.unused()) if not (retries and n.startswith(later))]
-        if not useless:
-            return
-        typed = {word[1:] for word in sys.argv if word.startswith("-")}
-        raise UsageError(options.explain(sorted(useless), typed, chosen.file, chosen.left_out))
+        prefix = self._options_prefix
+        later = PETSc.Options(prefix).getString("petsc_fs_retry", "none") != "none"
+        useless = [n for n in options.refused(options.unused()) if not (later and n.startswith(f"{prefix}retry_"))]
+        elsewhere = {name for name in useless if f"-{name}" in os.environ.get("PETSC_OPTIONS", "").split()}
+        if elsewhere:
+            logger.warning("of PETSC_OPTIONS nothing has asked for -%s", ", -".join(sorted(elsewhere)))
+        if others := sorted(set(useless) - elsewhere):
+            typed = {word[1:] for word in sys.argv if word.startswith("-")}
+            raise UsageError(options.explain(others, typed, self._file))
 
     def _option(self, name: str, choices: tuple[str, ...]) -> str:
         from petsc4py import PETSc
@@ -298,110 +306,35 @@ class FieldSplitSolver:
 
     # Solving
 
-    def _solve_by_policy(self, scene: Scene, rtol: float | None) -> _Outcome:
-        """Solve, and do what -petsc_fs_on_failure says where the tolerance is missed."""
-        policy = self._option("petsc_fs_on_failure", ON_FAILURE)
-        outcome = self._attempt(scene, rtol, retry=policy == "retry")
-        where = f"time step {scene.metadata.time_step_index}, Newton step {scene.metadata.newton_index}"
-        if not outcome.failure:
-            notes = () if outcome.result is None else outcome.result.notes
-            rungs = [note for note in notes if note.startswith("fallback ")]
-            if rungs:
-                logger.warning("%s: %s", where, "; ".join(rungs))
-            return outcome
-        if policy == "retry":
-            logger.warning("%s: %s; solving again by stronger means", where, outcome.failure)
-            return self._second_attempt(scene, rtol, outcome, where)
-        assert outcome.result is not None
-        if policy == "raise" or not outcome.result.true_relative_residual < 1:
-            outcome.action = "raised"
-            useless = "" if policy == "raise" else "; the update is no better than none"
-            outcome.error = SolveError(f"{where}: {outcome.failure}{useless}")
-        else:
-            outcome.action = "accepted"
-            logger.warning("%s: %s; the update is used all the same", where, outcome.failure)
-        return outcome
+    def _prepare_adapter(self) -> Adapter:
+        """What maps between the model and its scenes, once the model has its equations."""
+        from petsc_fs.porepy.adapter import Adapter
 
-    def _attempt(self, scene: Scene, rtol: float | None, *, retry: bool) -> _Outcome:
-        """Solve by the options of the model; an error is a failure like any other if there is a second attempt."""
-        try:
-            solver = self._updated_solver(scene)
-            return _outcome(solver, solver.solve(rtol))
-        except (SolveError, SceneError) as e:
-            self._forget_solver()
-            if not retry:
-                raise
-            return _Outcome(None, failure=str(e))
+        if self._adapter is None:
+            self._adapter = Adapter(self)
+        return self._adapter
 
-    def _second_attempt(self, scene: Scene, rtol: float | None, first: _Outcome, where: str) -> _Outcome:
-        from petsc4py import PETSc
-
-        prefix = f"{self._options_prefix}{RETRY}"
-        name = PETSc.Options(self._options_prefix).getString("petsc_fs_retry_file", RETRY_FILE)
-        file = _fitting_file(name, scene)
-        with options.inserted(file, prefix):
-            solver = self._create_solver(scene, prefix)
-            try:
-                second = _outcome(solver, solver.solve(rtol))
-            finally:
-                solver.destroy()
-        if second.failure:
-            second.action = "raised"
-            second.error = SolveError(f"{where}: {first.failure}; again by {file.name}: {second.failure}")
-        else:
-            second.action = "retried"
-        second.failure = first.failure
-        for name in ("setup_seconds", "solve_seconds", "transfer_seconds"):
-            setattr(second, name, getattr(first, name) + getattr(second, name))
-        return second
-
-    def _updated_solver(self, scene: Scene) -> ServedSolver:
-        """The solver with the values of the scene."""
+    def _updated_solver(self, scene: Scene) -> server.ServedSolver:
+        """The solver with the values of the scene; it is made with the first one."""
         if self._solver is None:
-            self._solver = self._create_solver(scene, self._options_prefix)
+            if self._client is None:  # on one rank; PETSc starts no earlier than with the first system
+                self._client = server.start()
+            assert self._client is not None
+            self._solver = server.ServedSolver(self._client, scene, prefix=self._options_prefix)
         else:
             self._solver.update(scene)
         return self._solver
 
-    def _create_solver(self, scene: Scene, prefix: str) -> ServedSolver:
-        if self._client is None:  # on one rank; PETSc starts no earlier than with the first system
-            self._client = server.start()
-        assert self._client is not None
-        return server.ServedSolver(self._client, scene, prefix=prefix)
-
-    def _forget_solver(self) -> None:
-        if self._solver is not None:
-            self._earlier_rebuilds = self._rebuilds + 1
-            self._solver.destroy()
-            self._solver = None
-
-    @property
-    def _rebuilds(self) -> int:
-        return self._earlier_rebuilds + (self._solver.rebuilds if self._solver is not None else 0)
-
-
-def _outcome(solver: ServedSolver, result: Result) -> _Outcome:
-    """What came of a solve, in words if it missed its tolerance."""
-    failure = ""
-    if not result.converged:
-        failure = (
-            f"{result.reason} after {result.iterations} iterations, true residual "
-            f"{result.true_relative_residual:.2e}, tolerance {result.tolerance:.2e}"
-            + "".join(f"; {note}" for note in result.notes)
-        )
-    return _Outcome(result, "", failure, result.setup_seconds, result.solve_seconds, solver.transfer_seconds)
-
-
-def _fitting_file(name: str, scene: Scene) -> Path:
-    """An options file that is for the fields of a scene.
-
-    Raises:
-        UsageError: there is no such file, or it is for other fields.
-    """
-    header = options.read_header(options.find_options_file(name))
-    if not header.fits(scene.fields):
-        raise UsageError(
-            f"{header.path.name} is for models with the fields {', '.join(header.fields)}; "
-            f"this one has {', '.join(in_order(scene.fields))}"
-        )
-    return header.path
+    def _judge(self, result: Result, policy: str) -> tuple[str, str]:
+        """Action and failure of a record, see `LinearSolve`."""
+        again = next((note for note in result.notes if note.startswith(FIRST)), "")
+        first = again.removeprefix(FIRST)
+        if result.converged:
+            return "retried" if again else "", first
+        failure = f"{result.verdict} after {result.iterations} iterations ({result.reason})"
+        failure = "; ".join([failure, *result.notes])
+        if policy != "accept":
+            return "raised", failure
+        if not result.true_relative_residual < 1:
+            return "raised", f"{failure}; the update is no better than none"
+        return "accepted", failure

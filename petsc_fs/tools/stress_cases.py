@@ -46,7 +46,7 @@ class Recipe:
         parameters: of `petsc_fs.porepy.cases.ModelParameters`.
         rock: of `petsc_fs.porepy.cases.Rock`; also `storage`, 1/M in 1/Pa.
         case: changes of `petsc_fs.porepy.cases.Case`.
-        twist: changes that no parameter makes, see `petsc_fs.porepy.stress_export`.
+        twist: changes that no parameter makes, see `scripts/stress_scenes`.
     """
 
     group: str
