@@ -202,6 +202,11 @@ def read_group(
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if rows is None and promised > memory:
         raise SceneError(f"takes {promised / 2**30:.0f} GiB, and this machine has {memory / 2**30:.0f} GiB")
+    for f, size in sizes.items():  # before anything is made of the sizes
+        if "rhs" not in group["fields"][f]:
+            raise LayoutError(f"{f}: rhs is missing")
+        if (rhs := group["fields"][f]["rhs"]).size != size:
+            raise LayoutError(f"{f}: rhs has shape {rhs.shape}, expected {(size,)}")
     chosen = {f: (0, n) for f, n in sizes.items()} if rows is None else rows(dimension, sizes)
     ranges = {f: (int(a), int(b)) for f, (a, b) in chosen.items()}
     arrays: dict[str, dict[str, Any]] = {what: {} for what in (*PER_ROW, *PER_CELL)}
