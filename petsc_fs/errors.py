@@ -27,9 +27,14 @@ class UsageError(PetscFsError):
 
 
 class SceneError(PetscFsError):
-    """A scene that cannot be read, or whose parts do not fit together."""
+    """A scene that cannot be read, or whose parts do not fit together.
+
+    Attributes:
+        cell: field and number of the cell that the message names, where that is not the scene's number yet.
+    """
 
     exit_code = 3
+    cell: tuple[str, int] | None = None
 
 
 class LayoutError(SceneError):

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from petsc_fs.errors import LayoutError, UsageError
+from petsc_fs.errors import LayoutError, SceneError, UsageError, together
 
 Blocks = dict[tuple[str, str], PETSc.Mat]
 """Matrices by (row field, column field); what is missing is zero."""
@@ -270,8 +270,6 @@ def inverse_of_diagonal(A: PETSc.Mat, what: str, exclude: str = "") -> PETSc.Mat
     Raises:
         SceneError: a block is singular to rounding; it is named by its number.
     """
-    from petsc_fs.errors import SceneError, together
-
     D, ((n, _), _) = A.getBlockSize(), A.getSizes()
     first = A.getOwnershipRange()[0]
     dense = diagonal_blocks(A, D)
@@ -280,7 +278,9 @@ def inverse_of_diagonal(A: PETSc.Mat, what: str, exclude: str = "") -> PETSc.Mat
         bad = np.flatnonzero(~(values[:, -1] > ALMOST_SINGULAR * values[:, 0]))
         if bad.size:
             more = f", and at {bad.size - 1} more on this rank" if bad.size > 1 else ""
-            raise SceneError(f"{what}: singular at cell {first // D + int(bad[0])}{more}{exclude}")
+            error = SceneError(f"{what}: singular at cell {first // D + int(bad[0])}{more}{exclude}")
+            error.cell = A.getName(), first // D + int(bad[0])
+            raise error
     inverse = np.linalg.inv(dense)
     columns = first + (np.arange(n // D) * D)[:, None, None] + np.zeros((D, 1), dtype=np.int64) + np.arange(D)
     csr = ((np.arange(n + 1) * D).astype(PETSc.IntType), columns.ravel().astype(PETSc.IntType), inverse.ravel())

@@ -186,7 +186,15 @@ class Solver:
         """
         started = time.perf_counter()
         with self._options():
-            _set_up(self.ksp)
+            try:
+                _set_up(self.ksp)
+            except SceneError as e:
+                if e.cell is not None and e.cell[0] in self.layout.fields:
+                    name, number = e.cell
+                    raise SceneError(
+                        f"{e}".replace(f"cell {number}", f"cell {self.layout.scene_cell(name, number)}", 1)
+                    ) from None
+                raise
         self._built_seconds += time.perf_counter() - started
 
     def solve(self, rtol: float | None = None, rhs: Mapping[str, NDArray[np.float64]] | None = None) -> Result:
