@@ -24,6 +24,8 @@ Floats = NDArray[np.float64]
 FieldArrays = dict[str, Floats]
 Pair = tuple[str, str]
 
+TIED = 6.0
+"""Difference of exponents up to which the fields of mechanics share one."""
 ROUNDS = 50
 """Rounds of equilibration between fields, of which there are few."""
 
@@ -31,7 +33,7 @@ ROUNDS = 50
 EPS = 2.0**-52
 ROUNDING_UNITS = 10
 """A residual of so many units of rounding of the terms of its equations cannot be told from zero."""
-SMALL = 1e-6
+SMALL = 1e-5
 """Relative residual of the equilibrated system from which rounding is no excuse."""
 
 
@@ -408,12 +410,12 @@ class _Rows:
 
     def __init__(self, layout: Layout, name: str, share: int | None) -> None:
         """Of a vector in the scene's numbering each rank has `share` rows; None: all of them are on rank 0."""
-        comm, size = layout.comm, layout.block_size(name)
+        comm = layout.comm
         local, total = layout.sizes(name)
         if share is None:
             share = 0 if comm.rank else total
-        cells = layout.own_cells(name).astype(PETSc.IntType)
-        self.numbers = PETSc.IS().createBlock(size, cells, comm=comm)
+        # without a block size, which MatCreateSubMatrix could not give to columns of which a rank needs some components
+        self.numbers = PETSc.IS().createGeneral(layout.own_rows(name).astype(PETSc.IntType), comm=comm)
         self._given = PETSc.Vec().createMPI((share, total), comm=comm)
         self._root = PETSc.Vec().createMPI((0 if comm.rank else total, total), comm=comm)
         self._own = PETSc.Vec().createMPI((local, total), comm=comm)
@@ -445,24 +447,21 @@ def row_exponents(sizes: Mapping[Pair, float]) -> dict[str, int]:
 
     Rows and columns of the matrix of norms are scaled in turns until the largest entry of each is one (Ruiz, "A scaling
     algorithm to equilibrate both rows and columns norms in matrices", RAL-TR-2001-034, 2001); the rows' factors are
-    what counts. Fields of mechanics, which multigrid treats together, have one in common, and it is zero where there
-    are any, so that the largest block stays as it is.
+    what counts. Fields of mechanics, which multigrid treats together, have one in common unless they are far apart, and
+    that of momentum is zero, so that the largest block stays as it is.
     """
-    group = {f: "mechanics" if f in MECHANICS else f for rc in sizes for f in rc}
-    logs: dict[Pair, float] = {}
-    for (r, c), n in sizes.items():
-        if n > 0 and math.isfinite(n):
-            key = group[r], c
-            logs[key] = max(logs.get(key, -math.inf), math.log2(n))
-    row, column = dict.fromkeys(group.values(), 0.0), dict.fromkeys(group, 0.0)
+    logs = {rc: math.log2(n) for rc, n in sizes.items() if n > 0 and math.isfinite(n)}
+    names = {f for rc in sizes for f in rc}
+    row, column = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0)
     for _ in range(ROUNDS):
         rows, columns = _largest(logs, row, column)
         row = {f: row[f] - rows.get(f, 0.0) / 2 for f in row}
         column = {f: column[f] - columns.get(f, 0.0) / 2 for f in column}
-    zero = row.get("mechanics", 0.0)
-    if "mechanics" not in row:
-        zero = row[min(row)]
-    return {f: round(row[g] - zero) for f, g in group.items()}
+    mechanics = [f for f in MECHANICS if f in names]
+    if len(mechanics) > 1 and np.ptp([row[f] for f in mechanics]) <= TIED:
+        row |= dict.fromkeys(mechanics, float(np.mean([row[f] for f in mechanics])))
+    zero = row[mechanics[-1] if mechanics else min(row)]
+    return {f: round(r - zero) for f, r in row.items()}
 
 
 def _largest(

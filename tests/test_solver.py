@@ -142,7 +142,7 @@ def test_whatever_the_krylov_method_the_verdict_is_that_of_the_system(database, 
     solver = Solver(scene)
     for _ in range(2):
         result = verified(scene, solver)
-    assert result.converged or odd == "preonly", result
+    assert result.converged or odd in ("preonly", "no norm"), result  # the latter has no iterations left for the error
 
 
 def test_a_factorisation_alone_is_enough(database):
@@ -305,11 +305,12 @@ def test_a_kept_solver_says_what_a_fresh_one_says_after_nine_other_matrices(data
         solver.update(scene)
         loose, kept = verified(scene, solver, solver.solve(1e-2)), verified(scene, solver)
         fresh = Solver(scene)
-        expected = verified(scene, fresh)
-        assert loose.converged
-        assert kept.converged == expected.converged
-        assert abs(kept.iterations - expected.iterations) <= 1
+        for result, rtol in ((loose, 1e-2), (kept, None)):
+            expected = verified(scene, fresh, fresh.solve(rtol))
+            assert result.converged == expected.converged
+            assert abs(result.iterations - expected.iterations) <= 1
         fresh.destroy()
+    assert kept.converged
     assert kept.iterations == expected.iterations
     for f, values in kept.solution.items():
         size = comm.allreduce(np.abs(values).max(initial=0), MPI.MAX)

@@ -216,6 +216,7 @@ MASS = Damage("lost", 0.148, "group")
 @example(Broken(2, {"mass": 3}, 52, (MASS,)))
 @example(Broken(2, {"mass": 3}, 205, (Damage("block", 0.0, "missing", 0.5),)))  # on two ranks hypre crashes on it
 @example(Broken(3, {"momentum": 5}, 164, (Damage("array", 0.541, "S3", 0.98),)))  # text for cell centres
+@example(Broken(2, dict(CELLS), 125, (Damage("array", 0.6968, "order", 0.0991),)))  # ranks need single components
 @example(Broken(2, dict(CELLS), 116, (), "contact_poromechanics_fast.opts", (("value", 0.127, "true"),)))
 def test_broken_input_gives_an_answer_or_one_clear_error(broken):
     with np.errstate(all="ignore"):

@@ -197,13 +197,13 @@ def test_what_a_check_says_is_so():
 
 
 def test_excess_is_the_worst_of_what_is_missed_but_for_rounding():
-    check = Check({"a": 1e-6, "b": 1e-12}, {"a": 1.0, "b": 1e-8}, {"a": 0.5, "b": 0.0})
+    check = Check({"a": 1e-6, "b": 1e-12}, {"a": 1.0, "b": 1e-8}, {"a": 0.5, "b": 0.0}, 1e-6)
     assert check.relative == pytest.approx(2e-6)
     assert check.backward == pytest.approx({"a": 1e-6, "b": 1e-4})
     assert check.excess(1e-7, 1e-2) == pytest.approx(20.0)
     assert check.excess(1e-3, 1e-6) == pytest.approx(100.0)
-    assert Check({"a": 1e-16}, {"a": 1.0}, {"a": 1e-12}).excess(1e-10, 1e-10) <= 1.0
-    assert Check({"a": 1e-14}, {"a": 1.0}, {"a": 1e-12}).excess(1e-10, 1e-10) > 1.0
+    for residual, balanced, fine in ((1e-16, 1e-6, True), (1e-14, 1e-6, False), (1e-16, 1.0, False)):
+        assert (Check({"a": residual}, {"a": 1.0}, {"a": 1e-12}, balanced).excess(1e-10, 1e-10) <= 1.0) == fine
 
 
 def test_rows_are_scaled_so_that_units_do_not_matter():

@@ -60,15 +60,14 @@ class FixedStress(WrapperPC):
         kinds = ("analytic", "algebraic") if base is not None else ("algebraic", "analytic")
         self.kind = choice(pc, "fs_type", kinds)
         self.damping = PETSc.Options(prefix).getReal("fs_damping", PUBLISHED_DAMPING)
+        mechanics = (complement, k if whole else None, block.getSizes()[0], prefix)
         if self.kind == "algebraic":
-            values = stabilisation(*_mechanics(complement, k if whole else None, prefix))
+            values = stabilisation(*_mechanics(*mechanics))
         elif base is not None:
             shape = np.ones(base.getLocalSize()) if ratio is None else ratio.getArray()
             values = base.getArray() * shape**self.damping
             if complement.getType() == "schurcomplement":
-                values = checked(
-                    values, shape != 1.0, stabilisation(*_mechanics(complement, k if whole else None, prefix))
-                )
+                values = checked(values, shape != 1.0, stabilisation(*_mechanics(*mechanics)))
         else:
             raise UsageError(
                 f"-{prefix}fs_type analytic: the block of {field} has no vector 'fixed_stress_base' (a scene without "
@@ -107,8 +106,16 @@ def checked(
     return np.where(wrong, algebraic, analytic)
 
 
-def _mechanics(complement: PETSc.Mat, k: int | None, prefix: str) -> tuple[PETSc.Mat, PETSc.Mat, PETSc.Mat]:
+def _mechanics(
+    complement: PETSc.Mat, k: int | None, own: tuple[int, int], prefix: str
+) -> tuple[PETSc.Mat, PETSc.Mat, PETSc.Mat]:
     """A_00 of a Schur complement, and the parts of A_01 and A_10 of its field k (None: it has one field alone).
+
+    Args:
+        complement: with respect to mechanics.
+        k: see above.
+        own: local and global size of the field.
+        prefix: of options, for errors.
 
     Raises:
         UsageError: the matrix is no Schur complement.
@@ -123,8 +130,17 @@ def _mechanics(complement: PETSc.Mat, k: int | None, prefix: str) -> tuple[PETSc
     A, B, C = (nest.borrowed(complement, handle) for handle in handles[1:4])
     if k is None:
         return A, B, C
+
+    def sizes(count: int) -> list[tuple[int, int]]:
+        """Of fields of mechanics, or of a single one, which may be a nest itself."""
+        return [A.getNestSubMatrix(i, i).getSizes()[0] for i in range(count)] if count > 1 else [A.getSizes()[0]]
+
     if B.getType() == "nest":
-        B = PETSc.Mat().createNest([[B.getNestSubMatrix(i, k)] for i in range(B.getNestSize()[0])], comm=B.comm)
+        rows = sizes(B.getNestSize()[0])
+        parts = [B.getNestSubMatrix(i, k) or nest.empty((n, own), B.comm) for i, n in enumerate(rows)]
+        B = PETSc.Mat().createNest([[part] for part in parts], comm=B.comm)
     if C.getType() == "nest":
-        C = PETSc.Mat().createNest([[C.getNestSubMatrix(k, j) for j in range(C.getNestSize()[1])]], comm=C.comm)
+        columns = sizes(C.getNestSize()[1])
+        parts = [C.getNestSubMatrix(k, j) or nest.empty((own, n), C.comm) for j, n in enumerate(columns)]
+        C = PETSc.Mat().createNest([parts], comm=C.comm)
     return A, B, C
