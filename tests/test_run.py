@@ -184,7 +184,8 @@ def test_an_interrupt_keeps_what_there_is(pp, tmp_path, number):
     _, err = process.communicate(timeout=60)
     done = records_of(tmp_path / "mine")
     summary = summary_of(tmp_path / "mine")
-    assert process.returncode == 130, err
+    # CPython ends by the signal itself, which is 130 to a shell, where it came in code made by exec.
+    assert process.returncode in (130, -signal.SIGINT), err
     (message,) = ours(err)
     assert (
         message
