@@ -133,11 +133,14 @@ class Refinement:
             if self.missing > 1.0 or self.iterations >= self.max_it:
                 break
         self.is_determined = False
-        found = {f: e for f, e in self.estimates.items() if not e <= DETERMINED} or self.estimates
+        wrong = {f: e for f, e in self.estimates.items() if not e <= DETERMINED}
         self.notes += (
             "ill-conditioned: the residual is small, but says little of the error, which is estimated at "
-            + ", ".join(f"{e:.0e} ({f})" for f, e in found.items())
-            + f" of the solution; at most {DETERMINED:g} counts as converged",
+            + ", ".join(f"{e:.0e} ({f})" for f, e in wrong.items())
+            + f" of the solution; at most {DETERMINED:g} counts as converged"
+            if wrong
+            else "the residual is small, but casts doubt on the solution, and its error could not be measured: the "
+            "Krylov method failed on another right-hand side",
         )
 
     def _least_singular_value(self) -> float:
@@ -168,7 +171,7 @@ class Refinement:
         parts = [v * (there[f] / (sizes[f] or 1.0)) for f, v in random.items()]
         kept, reason, rest = self.r.copy(), self.reason, self.r.duplicate()
         self.r.setArray(self.r.getArray() + np.concatenate(parts))
-        self._pass(MEASURE)
+        self._pass(MEASURE, self.max_it)
         self.ksp.getOperators()[0].mult(self.d, rest)
         rest.aypx(-1.0, self.r)
         solved = rest.norm() <= SOLVED * self.r.norm()
@@ -185,10 +188,10 @@ class Refinement:
         found = self.system.norms(self.system.by_field(part))
         return {f: n / (max(sizes[f], least[f]) or 1.0) for f, n in found.items()}
 
-    def _pass(self, rtol: float) -> None:
+    def _pass(self, rtol: float, max_it: int = 0) -> None:
         """Run a Krylov method on the present residual; what it finds is in `d`. Collective."""
         ksp = self.ksp
-        ksp.setTolerances(rtol=rtol, atol=0.0, max_it=max(self.max_it - self.iterations, 1))
+        ksp.setTolerances(rtol=rtol, atol=0.0, max_it=max_it or max(self.max_it - self.iterations, 1))
         try:
             ksp.solve(self.r, self.d)
         except (PETSc.Error, ImportError) as e:
