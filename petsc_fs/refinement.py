@@ -18,6 +18,8 @@ MOST_PASSES = 20
 """The Krylov method and its corrections; each has to halve what is missing."""
 PETSC_ATOL = 1e-50
 """PETSc's own absolute tolerance, which stands for none."""
+HOPELESS = ("DIVERGED_DTOL", "DIVERGED_INDEFINITE_PC", "DIVERGED_INDEFINITE_MAT", "DIVERGED_PC_FAILED")
+"""PETSc's reasons after which a correction will do no better."""
 MARGIN = 0.3
 """Part of a tolerance that the Krylov method is given, whose norm is not the user's: without it most solves would
 need a correction, with it they need at most two iterations more."""
@@ -75,14 +77,14 @@ class Refinement:
         """The Krylov method by its options. Collective."""
         if self.missing > 1.0:
             self._pass(MARGIN * max(self.rtol, min(self.goal, 0.5)))
-            self._take_step()
+            self._take_step(better=False)
 
     def correct(self) -> None:
         """Corrections, as long as each of them halves what is missing. Collective.
 
         The Krylov method stops in the norm of the equilibrated system, by a recursion that rounding may lead astray.
         """
-        if self.ksp.getType() == PETSc.KSP.Type.PREONLY:
+        if self.ksp.getType() == PETSc.KSP.Type.PREONLY or self.reason in HOPELESS:
             return
         while self.missing > 1.0 and self.passes < MOST_PASSES and self.iterations < self.max_it:
             old = self.missing
@@ -91,13 +93,13 @@ class Refinement:
             if self.missing > 0.5 * old:
                 return
 
-    def _take_step(self) -> None:
+    def _take_step(self, *, better: bool = True) -> None:
         """Add what the last pass has found, unless that makes it worse. Collective."""
         old = self.missing
         self._least = min(self._least, self._least_singular_value())
         self.x.axpy(1.0, self.d)
         self._judge()
-        if self.missing > max(old, 1.0):
+        if better and self.missing > max(old, 1.0):
             self.x.axpy(-1.0, self.d)
             self._judge()
         self._missed = max(self._missed, max(self.check.backward.values()) / self.field_goal)

@@ -17,7 +17,7 @@ from petsc4py import PETSc
 
 from petsc_fs import nest
 from petsc_fs import options as database
-from petsc_fs.errors import SceneError, UsageError
+from petsc_fs.errors import SceneError, SolveError, UsageError
 from petsc_fs.partition import Layout, chosen, partition
 from petsc_fs.petsc_errors import brief, translate
 from petsc_fs.refinement import PETSC_ATOL, Refinement
@@ -214,17 +214,29 @@ class Solver:
         wanted = max(self.rtol, rtol or 0.0)
         if rhs is not None:
             self.system.set_rhs(rhs)
-        self.set_up()
-        with self._options():
-            result = self._run(self.ksp, wanted)
-            if not result.converged:
-                result = self._look_for_null_vectors(result, wanted)
-        retry = PETSc.Options(self.prefix).getString("petsc_fs_retry", "none")
-        if not result.converged and retry != "none":
-            result = self._solve_again(retry, wanted, result)
+        file = PETSc.Options(self.prefix).getString("petsc_fs_retry", "none")
+        first: Result | SolveError | SceneError
+        try:
+            first = self._first(wanted)
+        except (SolveError, SceneError) as e:
+            if file == "none":
+                raise
+            e.__cause__ = e.__context__ = None  # whose frames would keep PETSc's objects, on some ranks only
+            first = e.with_traceback(None)
+        if isinstance(first, Result) and (first.converged or file == "none"):
+            result = first
+        else:
+            result = self._solve_again(file, wanted, first)
         result = replace(result, setup_seconds=self._built_seconds)
         self._built_seconds = 0.0
         return result
+
+    def _first(self, wanted: float) -> Result:
+        """By the options of this solver. Collective."""
+        self.set_up()
+        with self._options():
+            result = self._run(self.ksp, wanted)
+            return result if result.converged else self._look_for_null_vectors(result, wanted)
 
     def _run(self, ksp: PETSc.KSP, wanted: float) -> Result:
         """The Krylov method and its corrections, and what comes of them. Collective."""
@@ -289,12 +301,16 @@ class Solver:
 
     # The second solve
 
-    def _solve_again(self, name: str, wanted: float, first: Result) -> Result:
+    def _solve_again(self, name: str, wanted: float, first: Result | SolveError | SceneError) -> Result:
         """By another options file, on the same system. Collective."""
+        started = time.perf_counter()
         if self._retry is None:
             self._retry = _Retry(self, name)
         _set_up(self._retry.ksp)
+        self._built_seconds += time.perf_counter() - started
         second = self._run(self._retry.ksp, wanted)
+        if not isinstance(first, Result):
+            return replace(second, notes=(f"first solve: {first}; again by {name}", *second.notes))
         note = f"first solve: {first.verdict} after {first.iterations} iterations ({first.reason}); again by {name}"
         return replace(
             second,

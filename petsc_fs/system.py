@@ -31,7 +31,7 @@ ROUNDS = 50
 
 
 EPS = 2.0**-52
-ROUNDING_UNITS = 10
+ROUNDING_UNITS = 100
 """A residual of so many units of rounding of the terms of its equations cannot be told from zero."""
 SMALL = 1e-5
 """Relative residual of the equilibrated system from which rounding is no excuse."""

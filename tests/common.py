@@ -14,14 +14,13 @@ from petsc_fs.partition import Layout, rows_of
 from petsc_fs.result import Result
 from petsc_fs.scene import CSR, Scene
 from petsc_fs.solver import Solver
-from petsc_fs.system import System
+from petsc_fs.system import EPS, ROUNDING_UNITS, System
 
 comm = MPI.COMM_WORLD
 NAMES = tuple(path.stem for path in sorted(SCENES.glob("*.h5")))
 FILE = {"biot": "poromechanics.opts", "flow": "flow.opts", "contact": "contact_mechanics.opts"}
 """Options file of the published configuration; contact_poromechanics.opts for other scenes."""
 __all__ = ["MPI", "SCENES", "Layout", "rows_of"]
-EPS = 2.0**-52
 Arrays = Mapping[str, np.ndarray]
 
 
@@ -178,9 +177,9 @@ def confirm(scene: Scene, result: Result, solution: Arrays) -> None:
         found, exact = result.backward_error_by_field[f], backward[f]
         assert found >= exact / 1.0001 - 8 * EPS, f"{f}: backward error is said to be {found:.3e}, but is {exact:.3e}"
     if result.converged:
-        limit = result.tolerance * (1 + 1e-6) + 20 * EPS * np.linalg.norm([*terms.values()]) / b
+        limit = result.tolerance * (1 + 1e-6) + ROUNDING_UNITS * EPS * np.linalg.norm([*terms.values()]) / b
         assert relative <= limit, f"{relative:.3e} of {limit:.3e}"
-        worst, limit = max(backward.values()), max(result.field_tolerance * (1 + 1e-6), 20 * EPS)
+        worst, limit = max(backward.values()), max(result.field_tolerance * (1 + 1e-6), ROUNDING_UNITS * EPS)
         assert worst <= limit, f"{worst:.3e} of {limit:.3e}"
 
 
