@@ -85,6 +85,8 @@ class Solver:
         if not self.layout.fields:
             raise SceneError("the scene has no unknowns")
         self._scene = self._part(scene)
+        if release and scene is not None:
+            scene.blocks.clear()
         self._chosen = self._choose(mpi)
         self.left_out = self._chosen.left_out
         self._retry: _Retry | None = None
