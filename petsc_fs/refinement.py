@@ -58,7 +58,7 @@ class Refinement:
         self.system, self.ksp, self.rtol = system, ksp, rtol
         self.x, self.r, self.d = (system.b.duplicate() for _ in range(3))
         self.max_it = int(ksp.getTolerances()[3])
-        self.iterations = self.passes = 0
+        self.passes: list[int] = []  # iterations of each
         self.reason = "CONVERGED_ATOL"
         self.history: list[NDArray[np.float64]] = []
         self.notes: tuple[str, ...] = ()
@@ -73,6 +73,11 @@ class Refinement:
         self.field_goal = rtol
         self.missing = self.check.excess(self.goal, self.field_goal) if size else 0.0
 
+    @property
+    def iterations(self) -> int:
+        """Of all passes together."""
+        return sum(self.passes)
+
     def first(self) -> None:
         """The Krylov method by its options. Collective."""
         if self.missing > 1.0:
@@ -86,7 +91,7 @@ class Refinement:
         """
         if self.ksp.getType() == PETSc.KSP.Type.PREONLY or self.reason in HOPELESS:
             return
-        while self.missing > 1.0 and self.passes < MOST_PASSES and self.iterations < self.max_it:
+        while self.missing > 1.0 and len(self.passes) < MOST_PASSES and self.iterations < self.max_it:
             old = self.missing
             self._pass(min(max(MARGIN / old, LEAST_RTOL), 0.5))
             self._take_step()
@@ -199,8 +204,7 @@ class Refinement:
         except (PETSc.Error, ImportError) as e:
             raise translate(e, "solve failed") from None
         self._leave_null_space()
-        self.passes += 1
-        self.iterations += ksp.getIterationNumber()
+        self.passes.append(ksp.getIterationNumber())
         self.history.append(np.array(ksp.getConvergenceHistory()))
         self.reason = reason_name(ksp)
 

@@ -31,7 +31,7 @@ class Result:
         estimated_error_by_field: an estimate of the relative error: of one correction by the preconditioner, or by the
             Krylov method where that cast doubt. Empty where the residual is not small.
         error_by_field: |x - reference| / |reference|, where a reference is known; the absolute error where that is 0.
-        passes: how often the Krylov method ran: once, and once more for each correction.
+        passes: iterations of each run of the Krylov method: the first, corrections, and what measured the error.
         setup_seconds: building PETSc's matrices and setting the preconditioner up, for this solve.
         solve_seconds: the Krylov method and the checks.
         solution: local rows of each field, in the order of the layout; `System.gather` gives the scene's.
@@ -49,7 +49,7 @@ class Result:
     backward_error_by_field: dict[str, float]
     estimated_error_by_field: dict[str, float]
     error_by_field: dict[str, float]
-    passes: int
+    passes: tuple[int, ...]
     setup_seconds: float
     solve_seconds: float
     solution: FieldArrays = field(repr=False)

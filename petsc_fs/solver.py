@@ -267,7 +267,7 @@ class Solver:
             backward_error_by_field=check.backward,
             estimated_error_by_field=run.estimates,
             error_by_field=self._errors(solution),
-            passes=run.passes,
+            passes=tuple(run.passes),
             setup_seconds=0.0,
             solve_seconds=time.perf_counter() - started,
             solution=solution,
@@ -285,6 +285,7 @@ class Solver:
         return replace(
             again,
             iterations=result.iterations + again.iterations,
+            passes=result.passes + again.passes,
             solve_seconds=result.solve_seconds + again.solve_seconds,
             notes=(note + (". Solved for the solution without it" if again.converged else ""), *again.notes),
         )
@@ -317,6 +318,7 @@ class Solver:
         return replace(
             second,
             iterations=first.iterations + second.iterations,
+            passes=first.passes + second.passes,
             solve_seconds=first.solve_seconds + second.solve_seconds,
             notes=(note, *second.notes),
         )

@@ -65,6 +65,8 @@ class LinearSolve:
         unknowns: size of the system.
         ranks: number of ranks that solved it.
         iterations: of the outer Krylov method.
+        passes: iterations of each of its runs, see `petsc_fs.result.Result`.
+        passes: iterations of each of its runs, see `petsc_fs.result.Result`.
         reason: PETSc's name of the reason why it stopped.
         converged: whether the true residual meets the tolerance; see `petsc_fs.solver.Result`.
         true_relative_residual: |b - J x| / |b|.
@@ -103,6 +105,7 @@ class LinearSolve:
     action: str = ""
     failure: str = ""
     rebuilds: int = 0
+    passes: tuple[int, ...] = ()
 
 
 class FieldSplitSolver:
@@ -207,6 +210,7 @@ class FieldSplitSolver:
                 unknowns=update.size,
                 ranks=1 if self._client is None else self._client.comm.size,
                 iterations=result.iterations,
+                passes=result.passes,
                 reason=result.reason,
                 converged=result.converged,
                 true_relative_residual=result.true_relative_residual,
