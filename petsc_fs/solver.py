@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import itertools
 import time
 import weakref
 from collections.abc import Iterator, Mapping
@@ -97,7 +96,7 @@ class Solver:
             self.ksp = self._make_ksp(prefix)
         tolerances = self.ksp.getTolerances()
         self.rtol, self._atol = float(tolerances[0]), float(tolerances[1])
-        self._finalizer = weakref.finalize(self, _dropped.__setitem__, next(_numbers), _Parts(self))
+        self._finalizer = weakref.finalize(self, _dropped.__setitem__, _number(mpi), _Parts(self))
         self._finalizer.atexit = False  # where nothing collective may depend on what is alive on a rank
         self._built_seconds = time.perf_counter() - started
 
@@ -354,17 +353,25 @@ class _Parts:
         self.system.destroy()
 
 
-_numbers = itertools.count()
-_dropped: dict[int, _Parts] = {}
-"""Of solvers that were let go without `destroy`, by number; freed when ranks meet."""
+_numbers: dict[int, int] = {}
+"""How many solvers a communicator has had, which all of its ranks count alike; by handle."""
+_dropped: dict[tuple[int, int], _Parts] = {}
+"""Of solvers that were let go without `destroy`, by communicator and number; freed when its ranks meet."""
+
+
+def _number(comm: MPI.Intracomm) -> tuple[int, int]:
+    handle = comm.py2f()
+    _numbers[handle] = _numbers.get(handle, 0) + 1
+    return handle, _numbers[handle]
 
 
 def _destroy_dropped(comm: MPI.Intracomm) -> None:
     """Free what all ranks have let go of. Collective."""
-    if not comm.allreduce(len(_dropped), MPI.MIN):
+    mine = {number for handle, number in _dropped if handle == comm.py2f()}
+    if not comm.allreduce(len(mine), MPI.MIN):
         return
-    for number in sorted(set.intersection(*comm.allgather({n for n, p in _dropped.items() if p.comm == comm}))):
-        _dropped.pop(number).destroy()
+    for number in sorted(set.intersection(*comm.allgather(mine))):
+        _dropped.pop((comm.py2f(), number)).destroy()
     PETSc.garbage_cleanup(comm)
 
 

@@ -19,18 +19,18 @@ SHIPPED = {f.path.stem: f for f in options.shipped()}
 SIZES = {path.stem: hdf5.read_sizes(path)[1] for path in sorted(SCENES.glob("*.h5"))}
 
 ITERATIONS = {
-    "contact_mechanics": {"contact": 14},
-    "contact_mechanics_fast": {"contact": 17},
-    "contact_poromechanics": {"model1": 19, "model2": 18, "model3": 30},
-    "contact_poromechanics_fast": {"model1": 23, "model2": 22, "model3": 40},
-    "contact_poromechanics_gamg": {"model1": 54, "model2": 37, "model3": 50},
-    "contact_poromechanics_left": {"model1": 30, "model2": 18, "model3": 29},
+    "contact_mechanics": {"contact": 15},
+    "contact_mechanics_fast": {"contact": 18},
+    "contact_poromechanics": {"model1": 20, "model2": 18, "model3": 30},
+    "contact_poromechanics_fast": {"model1": 24, "model2": 22, "model3": 41},
+    "contact_poromechanics_gamg": {"model1": 54, "model2": 38, "model3": 51},
+    "contact_poromechanics_left": {"model1": 30, "model2": 19, "model3": 30},
     "fixed_stress_richardson": {"model1": 61},
     "flow": {"flow": 8},
     "flow_fast": {"flow": 11},
-    "poromechanics": {"biot": 14, "undrained": 20},
-    "poromechanics_fast": {"biot": 16, "undrained": 22},
-    "poromechanics_gamg": {"biot": 26, "undrained": 33},
+    "poromechanics": {"biot": 14, "undrained": 21},
+    "poromechanics_fast": {"biot": 17, "undrained": 23},
+    "poromechanics_gamg": {"biot": 27, "undrained": 34},
 }
 """On one rank."""
 
