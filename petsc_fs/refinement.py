@@ -18,7 +18,7 @@ MOST_PASSES = 20
 """The Krylov method and its corrections; each has to halve what is missing."""
 PETSC_ATOL = 1e-50
 """PETSc's own absolute tolerance, which stands for none."""
-HOPELESS = ("DIVERGED_DTOL", "DIVERGED_INDEFINITE_PC", "DIVERGED_INDEFINITE_MAT", "DIVERGED_PC_FAILED")
+HOPELESS = ("DIVERGED_DTOL", "DIVERGED_NANORINF", "DIVERGED_PC_FAILED", "DIVERGED_INDEFINITE_PC")
 """PETSc's reasons after which a correction will do no better."""
 MARGIN = 0.1
 """Part of a tolerance that the Krylov method is given, whose norm is not the user's: bundled scenes take a correction
@@ -93,10 +93,37 @@ class Refinement:
             return
         while self.missing > 1.0 and len(self.passes) < MOST_PASSES and self.iterations < self.max_it:
             old = self.missing
-            self._pass(min(max(MARGIN / old, LEAST_RTOL), 0.5))
+            self._pass(self._correction_rtol())
             self._take_step()
             if self.missing > 0.5 * old:
                 return
+
+    def _correction_rtol(self) -> float:
+        """Tolerance of a correction: a field that misses its own may be a small part of the residual. Collective."""
+        norms = self.system.norms(self.system.by_field(self.r))
+        wanted = [MARGIN / self.missing]
+        for f, e in self.check.backward.items():
+            if e > self.field_goal:
+                wanted.append(MARGIN * self.field_goal / e * norms[f] / (norm(norms) or 1.0))
+        return min(max(min(wanted), LEAST_RTOL), 0.5)
+
+    def explain(self) -> None:
+        """A note on why a solution does not count, where there is none yet. Collective."""
+        if self.missing <= 1.0 or self.notes:
+            return
+        if self.reason in HOPELESS and (where := broken_level(self.ksp.getPC())):
+            self.notes += (where,)
+        elif max(self.check.backward.values()) <= LIMIT:
+            self.notes += (
+                "the residual is as small as rounding allows, but not beside the right-hand side: the solution is so "
+                "large that the system is next to singular",
+            )
+        else:
+            found = [f for f, e in self.check.backward.items() if e > self.field_goal]
+            self.notes += (
+                f"the tolerance is missed by a factor of {self.missing:.1e}"
+                + (f", in the equations of {', '.join(found)}" if found else ""),
+            )
 
     def _take_step(self, *, better: bool = True) -> None:
         """Add what the last pass has found, unless that makes it worse. Collective."""
@@ -176,17 +203,24 @@ class Refinement:
         there, random = system.norms(system.by_field(self.r)), {f: scattered(system, f) for f in system.layout.fields}
         sizes = system.norms(random)
         parts = [v * (there[f] / (sizes[f] or 1.0)) for f, v in random.items()]
-        kept, reason, rest = self.r.copy(), self.reason, self.r.duplicate()
+        kept, reason, found, rest = self.r.copy(), self.reason, self.d.duplicate(), self.r.duplicate()
         self.r.setArray(self.r.getArray() + np.concatenate(parts))
-        self._pass(MEASURE, self.max_it)
-        self.ksp.getOperators()[0].mult(self.d, rest)
-        rest.aypx(-1.0, self.r)
-        solved = rest.norm() <= SOLVED * self.r.norm()
+        found.set(0.0)
+        size = self.r.norm()
+        for _ in range(MOST_IMPROVEMENTS):
+            self._pass(MEASURE, self.max_it)
+            found.axpy(1.0, self.d)
+            self.ksp.getOperators()[0].mult(self.d, rest)
+            self.r.axpy(-1.0, rest)
+            if self.r.norm() <= SOLVED * size or self.reason in HOPELESS:
+                break
+        solved = self.r.norm() <= SOLVED * size
+        relative = self._relative(found)
         kept.copy(self.r)
         self.reason = reason
-        for vector in (kept, rest):
+        for vector in (kept, found, rest):
             vector.destroy()
-        return self._relative(self.d) if solved else None
+        return relative if solved else None
 
     def _relative(self, part: PETSc.Vec) -> dict[str, float]:
         """Size of each field of a vector beside that of the solution, or beside what would change any equation."""

@@ -248,6 +248,7 @@ class Solver:
             run.first()
             run.correct()
             run.estimate_error()
+            run.explain()
             self._history = np.concatenate(run.history) if run.history else np.zeros(0)
             solution = {f: np.ldexp(v, -system.rhs_scale) for f, v in system.by_field(run.x).items()}
         finally:

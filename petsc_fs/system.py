@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 FieldArrays = dict[str, Floats]
 Pair = tuple[str, str]
 
-TIED = 6.0
+TIED = 1.0
 """Difference of exponents up to which the fields of mechanics share one."""
 ROUNDS = 50
 """Rounds of equilibration between fields, of which there are few."""
