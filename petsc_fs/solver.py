@@ -77,6 +77,7 @@ class Solver:
         mpi = comm or MPI.COMM_WORLD
         started = time.perf_counter()
         _destroy_dropped(mpi)
+        number = _number(mpi)
         self.prefix = prefix
         self._root_only = root_only
         whole = layout or partition(scene, mpi, *chosen(prefix), prefix)
@@ -96,7 +97,7 @@ class Solver:
             self.ksp = self._make_ksp(prefix)
         tolerances = self.ksp.getTolerances()
         self.rtol, self._atol = float(tolerances[0]), float(tolerances[1])
-        self._finalizer = weakref.finalize(self, _dropped.__setitem__, _number(mpi), _Parts(self))
+        self._finalizer = weakref.finalize(self, _dropped.__setitem__, number, _Parts(self))
         self._finalizer.atexit = False  # where nothing collective may depend on what is alive on a rank
         self._built_seconds = time.perf_counter() - started
 
@@ -360,8 +361,15 @@ _dropped: dict[tuple[int, int], _Parts] = {}
 """Of solvers that were let go without `destroy`, by communicator and number; freed when its ranks meet."""
 
 
+_anchors: dict[int, PETSc.IS] = {}
+"""An object for each communicator, which PETSc duplicates for the first object, collectively, and frees with the last,
+which ranks may have at different times after an error."""
+
+
 def _number(comm: MPI.Intracomm) -> tuple[int, int]:
     handle = comm.py2f()
+    if handle not in _anchors:
+        _anchors[handle] = PETSc.IS().createStride(0, comm=comm)
     _numbers[handle] = _numbers.get(handle, 0) + 1
     return handle, _numbers[handle]
 
