@@ -11,7 +11,7 @@ from sample import full_scene
 from petsc_fs import nest
 from petsc_fs.errors import LayoutError
 from petsc_fs.scene import Scene
-from petsc_fs.system import Check, System, row_exponents
+from petsc_fs.system import EPS, ROUNDING_UNITS, Check, System, row_exponents
 
 pytestmark = pytest.mark.mpi
 WAYS = ("whole", "share", "root")
@@ -202,7 +202,8 @@ def test_excess_is_the_worst_of_what_is_missed_but_for_rounding():
     assert check.backward == pytest.approx({"a": 1e-6, "b": 1e-4})
     assert check.excess(1e-7, 1e-2) == pytest.approx(20.0)
     assert check.excess(1e-3, 1e-6) == pytest.approx(100.0)
-    for residual, balanced, fine in ((1e-16, 1e-6, True), (1e-14, 1e-6, False), (1e-16, 1.0, False)):
+    unit = ROUNDING_UNITS * EPS
+    for residual, balanced, fine in ((0.5 * unit, 1e-6, True), (2 * unit, 1e-6, False), (0.5 * unit, 1.0, False)):
         assert (Check({"a": residual}, {"a": 1.0}, {"a": 1e-12}, balanced).excess(1e-10, 1e-10) <= 1.0) == fine
 
 
