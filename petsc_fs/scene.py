@@ -306,11 +306,12 @@ class Scene:
         found: dict[tuple[str, str], NDArray[np.bool_]] = {}
         for (r, c), block in self.blocks.items():
             full = block.data != 0
-            ends = np.concatenate([[0], np.cumsum(full)])[block.indptr]
+            every = bool(full.all())
+            ends = block.indptr if every else np.concatenate([[0], np.cumsum(full)])[block.indptr]
             seen = [(("equation", r), ends[1:] > ends[:-1])]
-            if self.rows is None:
+            if self.rows is None and not np.all(found.get(("unknown", c), False)):
                 used = np.zeros(self.sizes[c], dtype=bool)
-                used[block.indices[full]] = True
+                used[block.indices if every else block.indices[full]] = True
                 seen.append((("unknown", c), used))
             for key, mask in seen:
                 found[key] = found.get(key, False) | mask
