@@ -25,7 +25,7 @@ ITERATIONS = {
     "contact_poromechanics_fast": {"model1": 24, "model2": 22, "model3": 41},
     "contact_poromechanics_gamg": {"model1": 54, "model2": 38, "model3": 51},
     "contact_poromechanics_left": {"model1": 30, "model2": 19, "model3": 30},
-    "fixed_stress_richardson": {"model1": 61},
+    "fixed_stress_richardson": {"model1": 14},
     "flow": {"flow": 8},
     "flow_fast": {"flow": 11},
     "poromechanics": {"biot": 14, "undrained": 21},
