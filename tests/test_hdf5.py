@@ -346,7 +346,10 @@ DAMAGE = {
         store(f"{MM}/indptr", lambda p: np.append(p[:-1], p[-1] - 1)),
         r"block \(mass, mass\): indptr ends at \d+, but there are \d+ values",
     ),
-    "indptr_decreases": (store(f"{MM}/indptr", lambda p: p[[0, 2, 1, 3, 4, 5, 6]]), "indptr must .* not decrease"),
+    "indptr_decreases": (
+        store(f"{MM}/indptr", lambda p: p[[0, 2, 1, 3, 4, 5, 6]]),
+        "indptr must .* not decrease|columns of a row must increase",
+    ),
     "short_indices": (store(f"{MM}/indices", shorter), r"block \(mass, mass\): \d+ indices but \d+ values"),
     "long_indices": (store(f"{MM}/indices", longer), r"block \(mass, mass\): \d+ indices but \d+ values"),
     "short_data": (store(f"{MM}/data", shorter), r"block \(mass, mass\): \d+ indices but \d+ values"),
