@@ -66,7 +66,6 @@ class LinearSolve:
         ranks: number of ranks that solved it.
         iterations: of the outer Krylov method.
         passes: iterations of each of its runs, see `petsc_fs.result.Result`.
-        passes: iterations of each of its runs, see `petsc_fs.result.Result`.
         reason: PETSc's name of the reason why it stopped.
         converged: whether the true residual meets the tolerance; see `petsc_fs.solver.Result`.
         true_relative_residual: |b - J x| / |b|.
