@@ -19,7 +19,7 @@ from petsc_fs import options as database
 from petsc_fs.errors import SceneError, SolveError, UsageError
 from petsc_fs.partition import Layout, chosen, partition
 from petsc_fs.petsc_errors import brief, translate
-from petsc_fs.refinement import PETSC_ATOL, Refinement
+from petsc_fs.refinement import PETSC_ATOL, Refinement, Spectrum
 from petsc_fs.result import Result
 from petsc_fs.scene import Scene
 from petsc_fs.singular import attach, describe, null_vectors
@@ -151,8 +151,7 @@ class Solver:
             ksp.destroy()
             raise UsageError(f"PETSc refuses an option: {brief(e)}") from e
         ksp.setConvergenceHistory(reset=True)
-        if ksp.getType() == PETSc.KSP.Type.GMRES:
-            ksp.setComputeSingularValues(True)  # of what it projects anyway
+        Spectrum(ksp)
         return ksp
 
     def update(self, scene: Scene | None) -> None:
