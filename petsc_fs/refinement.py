@@ -32,8 +32,9 @@ STRICTER = 1e-2
 LEAST_RTOL = 1e-12
 """Tolerance of the Krylov method that its recursion can still keep."""
 DETERMINED = 1e-3
-"""Estimated or measured relative error of each field up to which a solution counts as one: a tenth of what is claimed,
-as some of an error may be missed."""
+"""Relative error of each field, estimated or measured, up to which a solution is taken as it is."""
+ACCEPTED = 1e-2
+"""The same where rounding allows no better one."""
 BALANCED = 1e-6
 """Imbalance of a field from which a solution is in doubt."""
 NOISE = 2.0
@@ -202,7 +203,7 @@ class Refinement:
             if step <= DETERMINED or final:
                 found, doubtful = self._measured(), True
                 self.estimates = found or self.estimates
-                if found is not None and max(found.values()) <= DETERMINED:
+                if found is not None and max(found.values()) <= (ACCEPTED if final else DETERMINED):
                     return
                 if final or found is None:
                     break
@@ -212,11 +213,11 @@ class Refinement:
             if self.missing > 1.0 or self.iterations >= self.max_it:
                 break
         self.is_determined = False
-        wrong = {f: e for f, e in self.estimates.items() if not e <= DETERMINED}
+        wrong = {f: e for f, e in self.estimates.items() if not e <= ACCEPTED}
         self.notes += (
             "ill-conditioned: the residual is small, but says little of the error, which is estimated at "
             + ", ".join(f"{e:.0e} ({f})" for f, e in wrong.items())
-            + f" of the solution; at most {DETERMINED:g} counts as converged"
+            + f" of the solution; at most {ACCEPTED:g} counts as converged"
             if wrong
             else "the residual is small, but casts doubt on the solution, and its error could not be measured: the "
             "Krylov method failed on another right-hand side",
