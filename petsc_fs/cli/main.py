@@ -15,9 +15,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from petsc_fs import options
+from petsc_fs import missing, options
 from petsc_fs.errors import PetscFsError, UsageError, together
-from petsc_fs.io.bundled import bundled, find_scene
+from petsc_fs.io.bundled import bundled, find_scene, versions
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -69,8 +69,12 @@ format has no place for (cell data, material, units), without which the way back
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code. Collective on all ranks of an MPI run."""
-    from mpi4py import MPI
-
+    try:
+        import petsc4py  # noqa: F401
+        from mpi4py import MPI
+    except (ImportError, RuntimeError) as e:  # the latter from a wheel of mpi4py that finds no MPI
+        print(f"petsc-fs: {missing(e)}", file=sys.stderr)
+        return UsageError.exit_code
     comm = MPI.COMM_WORLD
     locale.setlocale(locale.LC_NUMERIC, "C")  # or PETSc reads no decimal points
     for stream in (sys.stdout, sys.stderr):
@@ -166,6 +170,15 @@ def _describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}{where}"
 
 
+class _Version(argparse.Action):
+    """Print the versions of all that takes part, and end. Collective."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        options.Given.of([]).start()
+        print("\n".join(f"{name:12}{version}" for name, version in versions().items()))
+        parser.exit()
+
+
 class _Parser(argparse.ArgumentParser):
     """One line on a wrong call, as for any other error."""
 
@@ -176,6 +189,7 @@ class _Parser(argparse.ArgumentParser):
 def _parser(command: list[str]) -> argparse.ArgumentParser:
     raw = argparse.RawDescriptionHelpFormatter
     parser = _Parser(prog="petsc-fs", description=DESCRIPTION, formatter_class=raw)
+    parser.add_argument("--version", action=_Version, nargs=0, help="show versions of all that takes part")
     parser.set_defaults(summary=None, close=None)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
