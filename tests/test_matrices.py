@@ -301,6 +301,9 @@ def test_commands_take_names_of_the_users_own(tmp_path):
     assert (theirs.returncode, theirs.stderr, theirs.stdout) == (0, "", ours.stdout)
     solved = petsc_fs("solve", path, "--fields", "u=momentum,p=mass")
     assert (solved.returncode, solved.stderr) == (0, "")
+    written = petsc_fs("convert", path, tmp_path / "ours.h5", "--fields", "u=momentum,p=mass")
+    assert (written.returncode, written.stderr) == (0, "")
+    assert_same(hdf5.read(SCENES / "biot.h5"), hdf5.read(tmp_path / "ours.h5"))
     wrong = petsc_fs("solve", path, "--fields", "u=pressure")
     assert (wrong.returncode, wrong.stdout, wrong.stderr.count("\n")) == (2, "", 1)
     assert "--fields: cannot read 'u=pressure'" in wrong.stderr
@@ -312,6 +315,9 @@ def test_a_matrix_becomes_a_scene_on_the_command_line(tmp_path):
     lacking = petsc_fs("convert", *words)
     assert (lacking.returncode, lacking.stdout, lacking.stderr.count("\n")) == (2, "", 1)
     assert "--rows: a matrix needs --rhs FILE and --dimension 2 or 3 besides" in lacking.stderr
+    lacking = petsc_fs("convert", tmp_path / matrix, tmp_path / "a.h5", "--rhs", tmp_path / rhs)
+    assert (lacking.returncode, lacking.stdout, lacking.stderr.count("\n")) == (2, "", 1)
+    assert "a matrix, which needs --rows FIELD=ROWS,... too" in lacking.stderr
     done = petsc_fs("convert", *words, "--rhs", tmp_path / rhs, "--dimension", 2)
     assert (done.returncode, done.stderr, done.stdout) == (0, "", f"written: {tmp_path / 'a.h5'}\n")
     assert hdf5.read(tmp_path / "a.h5").sizes == {"momentum": 40, "mass": 20}

@@ -224,8 +224,15 @@ def _parser(command: list[str]) -> argparse.ArgumentParser:
     lint.add_argument("file", metavar="FILE", help="options file, or the name of a shipped one")
     lint.add_argument("scene", metavar="SCENE", nargs="?", help="scene it is for; default a bundled one that fits")
 
-    convert = add("convert", "turn a scene into PETSc's binary format, or back", _convert, epilog=CONVERT_EPILOG)
-    convert.add_argument("source", metavar="SOURCE", help="scene or sequence (.h5), or folder in PETSc's format")
+    convert = add(
+        "convert",
+        "turn a matrix into a scene, a scene into PETSc's binary format, or back",
+        _convert,
+        epilog=CONVERT_EPILOG,
+    )
+    convert.add_argument(
+        "source", metavar="SOURCE", help="scene or sequence (.h5), folder in PETSc's format, or matrix"
+    )
     convert.add_argument("target", metavar="TARGET", help="folder to write, or scene (.h5)")
     convert.add_argument("--step", type=int, metavar="K", help="of a sequence, write this step as a scene; from 0")
     convert.add_argument("--dimension", type=int, choices=(2, 3), help="of the rock, where nothing in SOURCE tells it")
@@ -278,23 +285,25 @@ def _convert(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) ->
     if comm.size > 1:
         raise UsageError("convert runs on one rank; start it without mpiexec")
     options.Given.of([]).start()
-    from petsc_fs.io import matrices, petsc_binary
+    from petsc_fs.io import hdf5, matrices, petsc_binary, sequence
 
     source, target = Path(args.source), Path(args.target)
-    if args.step is not None:
-        from petsc_fs.io import hdf5, sequence
-
-        if target.suffix != ".h5":
-            raise UsageError(f"{target}: a step becomes a scene, whose name ends in .h5")
-        written = [hdf5.write(sequence.read(find_scene(args.source), args.step), target)]
-    elif args.rows is not None:
+    if args.rows is None and (args.rhs or args.dofmap):
+        raise UsageError("--rhs and --dofmap are about a matrix, which needs --rows FIELD=ROWS,... too")
+    if args.rows is not None:
         if args.rhs is None or args.dimension is None:
             raise UsageError("--rows: a matrix needs --rhs FILE and --dimension 2 or 3 besides")
         more = {"dimension": args.dimension, "order": args.order, "dofmap": args.dofmap}
         written = matrices.to_scene(source, target, rhs=args.rhs, rows=args.rows, **more)
-    elif source.is_dir():
+    elif source.is_dir() and args.step is None:
         written = petsc_binary.to_scene(source, target, dimension=args.dimension)
-    else:
+    elif args.step is None and target.suffix != ".h5":
         written = petsc_binary.from_scene(find_scene(args.source), target)
+    else:
+        if target.suffix != ".h5":
+            raise UsageError(f"{target}: a step becomes a scene, whose name ends in .h5")
+        path = find_scene(args.source)
+        scene = hdf5.read(path) if args.step is None else sequence.read(path, args.step)
+        written = [hdf5.write(scene, target)]
     print(f"written: {', '.join(str(p) for p in written)}")
     return 0

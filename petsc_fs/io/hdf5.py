@@ -263,7 +263,7 @@ def open_file(path: Path) -> Iterator[h5py.File]:
         ):
             if sign in str(e):
                 raise SceneError(f"{path}: {meaning}") from e
-        raise SceneError(f"{path}: not an HDF5 file, so not a scene; make one with petsc-fs export") from e
+        raise SceneError(f"{path}: not an HDF5 file, so not a scene; make one with petsc-fs export or convert") from e
     with file, explained(path):
         yield file
 
