@@ -62,8 +62,9 @@ TAKE_FILES = ("options_file", "petsc_fs_retry", "petsc_fs_retry_file")
 
 def shipped_folder() -> Path:
     """Folder of the options files that come with this package."""
-    inside = Path(__file__).parent / "options_files"
-    return inside if inside.is_dir() else Path(__file__).parent.parent / "options"  # in a checkout
+    home = Path(__file__).resolve().parent
+    inside = home / "options_files"
+    return inside if inside.is_dir() else home.parent / "options"  # in a checkout
 
 
 def find_options_file(name: str) -> Path:
