@@ -182,15 +182,6 @@ def _describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}{where}"
 
 
-class _Version(argparse.Action):
-    """Print the versions of all that takes part, and end. Collective."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
-        options.Given.of([]).start()
-        print("\n".join(f"{name:12}{version}" for name, version in versions().items()))
-        parser.exit()
-
-
 class _Parser(argparse.ArgumentParser):
     """One line on a wrong call, as for any other error."""
 
@@ -201,7 +192,6 @@ class _Parser(argparse.ArgumentParser):
 def _parser(command: list[str]) -> argparse.ArgumentParser:
     raw = argparse.RawDescriptionHelpFormatter
     parser = _Parser(prog="petsc-fs", description=DESCRIPTION, formatter_class=raw)
-    parser.add_argument("--version", action=_Version, nargs=0, help="show versions of all that takes part")
     parser.set_defaults(summary=None, close=None)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
@@ -248,7 +238,17 @@ def _parser(command: list[str]) -> argparse.ArgumentParser:
     convert.add_argument(
         "--fields", type=learn_aliases, metavar="NAME=FIELD,...", help="other names of fields there: u=momentum,p=mass"
     )
+    parser.add_argument("--version", action=_Version, nargs=0, help="show versions of all that takes part")
     return parser
+
+
+class _Version(argparse.Action):
+    """Print the versions of all that takes part, and end. Collective."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        options.Given.of([]).start()
+        print("\n".join(f"{name:12}{version}" for name, version in versions().items()))
+        parser.exit()
 
 
 def _options(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
