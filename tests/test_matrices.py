@@ -85,7 +85,7 @@ def as_ij(*ends: int, base: int = 0, named: str = "IJ.out.A") -> Callable[..., t
             for i in range(start, stop):
                 columns = sorted(np.flatnonzero(A[i]), key=lambda j: (j != i, j))
                 lines += [f"{i + base} {j + base} {A[i, j]:.17e}" for j in columns]
-                values.append(f"{i + base} {b[i]:.17e}")
+                values.insert(1, f"{i + base} {b[i]:.17e}")  # in any order
             (folder / f"IJ.out.A.{rank:05}").write_text("\n".join(lines) + "\n")
             (folder / f"IJ.out.b.{rank:05}").write_text("\n".join(values) + "\n")
         return named, "IJ.out.b"
@@ -173,6 +173,7 @@ def test_rows_by_labels_of_hypre(tmp_path):
         ("mass=0:6,", "cannot read ''"),
         ("mass=0:12:0", "cannot read"),
         ("mass=@", "cannot read"),
+        ("momentum=0:6,mass=6:13", "'mass=6:13' goes beyond the 12 rows"),
     ],
 )
 def test_words_that_say_no_rows_are_named(words, message):
@@ -231,6 +232,13 @@ def test_labels_must_be_as_many_as_announced(tmp_path, content):
     (tmp_path / "dofmap.00000").write_text(content)
     with pytest.raises(SceneError, match=r"dofmap.00000: "):
         matrices.read_labels(tmp_path / "dofmap")
+
+
+def test_there_must_be_a_label_for_each_row(system, tmp_path):
+    matrix, rhs = (tmp_path / name for name in as_npy(*system, tmp_path))
+    (tmp_path / "dofmap.00000").write_text("3\n0\n1\n2\n")
+    with pytest.raises(SceneError, match="dofmap: has 3 labels, the matrix has 60 rows"):
+        matrices.to_scene(matrix, tmp_path / "a.h5", rhs=rhs, rows=ROWS, dimension=2, dofmap=tmp_path / "dofmap")
 
 
 def test_scipy_is_asked_for(system, tmp_path, monkeypatch):

@@ -58,12 +58,12 @@ def to_scene(
         SceneError: a file cannot be read, or they do not fit together.
         UsageError: `rows` cannot be read, or scipy is needed.
     """
-    b = read_vector(rhs)
+    b, matrix = read_vector(rhs), read_matrix(source)
+    n = matrix.indptr.size - 1 if isinstance(matrix, CSR) else (*matrix.shape, 0)[0]
     labels = None if dofmap is None else read_labels(dofmap)
-    if labels is not None and labels.size != b.size:
-        raise SceneError(f"{dofmap}: has {labels.size} labels, the right-hand side has {b.size} rows")
-    fields = parse_rows(rows, b.size, labels)
-    matrix = read_matrix(source)
+    if labels is not None and labels.size != n:
+        raise SceneError(f"{dofmap}: has {labels.size} labels, the matrix has {n} rows")
+    fields = parse_rows(rows, n, labels)
     try:
         scene = Scene.from_matrix(matrix, b, fields, dimension=dimension, order=order)
     except SceneError as e:
@@ -92,7 +92,9 @@ def read_vector(path: Path) -> Floats:
     """A vector; see `read_matrix`."""
     parts, found = _load(path, "vector")
     if found is None and re.fullmatch(f".*{OF_A_RANK}", parts[0].name):
-        found = _ij(parts, 1)[2][:, 1]
+        first, size, entries = _ij(parts, 1)
+        found = np.zeros(size)
+        found[whole_numbers(entries[:, 0] - first, f"{path}: numbers of rows")] = entries[:, 1]
     elif found is None:
         found = _numbers(path)
     dense = np.asarray(found.toarray() if hasattr(found, "toarray") else found)
@@ -144,7 +146,12 @@ def parse_rows(text: str, n: int, labels: Integers | None = None) -> dict[str, I
         if spec.startswith("@"):
             ids = read_rows(Path(spec[1:]))
         elif ":" in spec:
-            ids = every[slice(*(int(end) if end else None for end in spec.split(":")))]
+            ends = [int(end) if end else None for end in spec.split(":")]
+            if any(end is not None and abs(end) > every.size for end in ends):
+                raise UsageError(
+                    f"--rows: {word!r} goes beyond the {every.size} {'rows' if labels is None else 'labels'}"
+                )
+            ids = every[slice(*ends)]
         else:
             ids = np.array([int(spec)])
         found.setdefault(name, []).append(ids)
