@@ -15,9 +15,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from petsc_fs import options
+from petsc_fs import missing, options
 from petsc_fs.errors import PetscFsError, UsageError, together
-from petsc_fs.io.bundled import bundled, find_scene
+from petsc_fs.fields import learn_aliases
+from petsc_fs.io.bundled import bundled, find_scene, versions
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -64,13 +65,28 @@ CONVERT_EPILOG = """\
 The folder holds matrix.petsc (MatLoad), rhs.petsc and, if known, reference.petsc (VecLoad), one
 fields/NAME.petsc per field (ISLoad: the rows and columns of the field), and scene.h5 with what PETSc's
 format has no place for (cell data, material, units), without which the way back gives less and needs
---dimension."""
+--dimension.
+
+A matrix alone is in Matrix Market's format or .npz (which need scipy), .npy, hypre's IJ files (all that
+have the prefix SOURCE), or PETSc's binary format; so is the right-hand side, or it is a text of numbers:
+
+  petsc-fs convert A.mtx mine.h5 --rhs b.mtx --rows momentum=0:100,mass=100:150 --dimension 2
+  petsc-fs convert A.npz mine.h5 --rhs b.npy --rows momentum=@u.txt,mass=@p.txt --dimension 3
+  petsc-fs convert IJ.out.A mine.h5 --rhs IJ.out.b --dofmap dofmap.out --rows momentum=0:3,mass=3 --dimension 3
+
+Rows are slices as in Python, single numbers, or @FILE with numbers (from 0; -1 for an unknown that was
+eliminated, which becomes an equation x = 0); more than one for a field follow each other:
+mass=100:150,160:170. With --dofmap they are labels."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code. Collective on all ranks of an MPI run."""
-    from mpi4py import MPI
-
+    try:
+        import petsc4py  # noqa: F401
+        from mpi4py import MPI
+    except (ImportError, RuntimeError) as e:  # the latter from a wheel of mpi4py that finds no MPI
+        print(f"petsc-fs: {missing(e)}", file=sys.stderr)
+        return UsageError.exit_code
     comm = MPI.COMM_WORLD
     locale.setlocale(locale.LC_NUMERIC, "C")  # or PETSc reads no decimal points
     for stream in (sys.stdout, sys.stderr):
@@ -198,14 +214,41 @@ def _parser(command: list[str]) -> argparse.ArgumentParser:
     lint.add_argument("file", metavar="FILE", help="options file, or the name of a shipped one")
     lint.add_argument("scene", metavar="SCENE", nargs="?", help="scene it is for; default a bundled one that fits")
 
-    convert = add("convert", "turn a scene into PETSc's binary format, or back", _convert, epilog=CONVERT_EPILOG)
-    convert.add_argument("source", metavar="SOURCE", help="scene or sequence (.h5), or folder in PETSc's format")
+    convert = add(
+        "convert",
+        "turn a matrix into a scene, a scene into PETSc's binary format, or back",
+        _convert,
+        epilog=CONVERT_EPILOG,
+    )
+    convert.add_argument(
+        "source", metavar="SOURCE", help="scene or sequence (.h5), folder in PETSc's format, or matrix"
+    )
     convert.add_argument("target", metavar="TARGET", help="folder to write, or scene (.h5)")
     convert.add_argument("--step", type=int, metavar="K", help="of a sequence, write this step as a scene; from 0")
+    convert.add_argument("--dimension", type=int, choices=(2, 3), help="of the rock, where nothing in SOURCE tells it")
+    convert.add_argument("--rows", metavar="FIELD=ROWS,...", help="of a matrix: which rows belong to which field")
+    convert.add_argument("--rhs", type=Path, metavar="FILE", help="of a matrix: the right-hand side")
     convert.add_argument(
-        "--dimension", type=int, choices=(2, 3), help="of the rock, where SOURCE is a folder without scene.h5"
+        "--dofmap", type=Path, metavar="FILE", help="of a matrix: labels of the rows, as hypre has them"
     )
+    convert.add_argument(
+        "--order", choices=("cell", "component"), default="cell",
+        help="of a matrix: vector fields list all components of a cell before the next cell, or the other way round",
+    )  # fmt: skip
+    convert.add_argument(
+        "--fields", type=learn_aliases, metavar="NAME=FIELD,...", help="other names of fields there: u=momentum,p=mass"
+    )
+    parser.add_argument("--version", action=_Version, nargs=0, help="show versions of all that takes part")
     return parser
+
+
+class _Version(argparse.Action):
+    """Print the versions of all that takes part, and end. Collective."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        options.Given.of([]).start()
+        print("\n".join(f"{name:12}{version}" for name, version in versions().items()))
+        parser.exit()
 
 
 def _options(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
@@ -242,18 +285,25 @@ def _convert(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) ->
     if comm.size > 1:
         raise UsageError("convert runs on one rank; start it without mpiexec")
     options.Given.of([]).start()
-    from petsc_fs.io import petsc_binary
+    from petsc_fs.io import hdf5, matrices, petsc_binary, sequence
 
     source, target = Path(args.source), Path(args.target)
-    if args.step is not None:
-        from petsc_fs.io import hdf5, sequence
-
+    if args.rows is None and (args.rhs or args.dofmap):
+        raise UsageError("--rhs and --dofmap are about a matrix, which needs --rows FIELD=ROWS,... too")
+    if args.rows is not None:
+        if args.rhs is None or args.dimension is None:
+            raise UsageError("--rows: a matrix needs --rhs FILE and --dimension 2 or 3 besides")
+        more = {"dimension": args.dimension, "order": args.order, "dofmap": args.dofmap}
+        written = matrices.to_scene(source, target, rhs=args.rhs, rows=args.rows, **more)
+    elif source.is_dir() and args.step is None:
+        written = petsc_binary.to_scene(source, target, dimension=args.dimension)
+    elif args.step is None and target.suffix != ".h5":
+        written = petsc_binary.from_scene(find_scene(args.source), target)
+    else:
         if target.suffix != ".h5":
             raise UsageError(f"{target}: a step becomes a scene, whose name ends in .h5")
-        written = [hdf5.write(sequence.read(find_scene(args.source), args.step), target)]
-    elif source.is_dir():
-        written = petsc_binary.to_scene(source, target, dimension=args.dimension)
-    else:
-        written = petsc_binary.from_scene(find_scene(args.source), target)
+        path = find_scene(args.source)
+        scene = hdf5.read(path) if args.step is None else sequence.read(path, args.step)
+        written = [hdf5.write(scene, target)]
     print(f"written: {', '.join(str(p) for p in written)}")
     return 0

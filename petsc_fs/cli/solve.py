@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from petsc_fs import options
 from petsc_fs.errors import PetscFsError, UsageError, together
+from petsc_fs.fields import learn_aliases
 from petsc_fs.io import hdf5, sequence
 from petsc_fs.io.bundled import check_targets, find_scene, versions
 from petsc_fs.io.files import write_text
@@ -49,6 +50,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `command`."""
     parser.epilog = EPILOG
     parser.add_argument("scene", metavar="SCENE", help="file, or name of a bundled one such as model1.h5")
+    parser.add_argument(
+        "--fields", type=learn_aliases, metavar="NAME=FIELD,...", help="other names of fields there: u=momentum,p=mass"
+    )
     parser.add_argument("--report", type=Path, metavar="FILE.json", help="write what was done and measured")
     parser.add_argument("--save", type=Path, metavar="FILE.h5", help="write the solution, in the scene's numbering")
     parser.add_argument("--steps", metavar="A:B", help="of a sequence, solve these only; from 0, B excluded")
