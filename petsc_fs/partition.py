@@ -60,7 +60,8 @@ class Layout:
 
     def __repr__(self) -> str:
         sizes = ", ".join(f"{f} {self.sizes(f)[1]:,}" for f in self.fields)
-        return f"<Layout, {self.dimension}D, of {self.comm.size} ranks: {sizes}>"
+        ranks = self.comm.size
+        return f"<Layout, {self.dimension}D, on {ranks} rank{'s' if ranks > 1 else ''}: {sizes}>"
 
     @classmethod
     def contiguous(cls, comm: MPI.Intracomm, dimension: int, sizes: Mapping[str, int]) -> Layout:

@@ -102,7 +102,7 @@ class Solver:
 
     def __repr__(self) -> str:
         default = self._chosen.file.name if self._chosen.file else "the smallest solver"
-        return f"<Solver by {default if self._chosen.values else 'options of the database'} on {self.layout!r}>"
+        return f"<Solver by {default if self._chosen.values else 'options of the database'} for {self.layout!r}>"
 
     @property
     def rebuilds(self) -> int:

@@ -71,7 +71,7 @@ def test_a_solver_without_options_is_that_of_the_command_line(tmp_path, name):
     petsc_fs("solve", f"{name}.h5", "--report", "report.json", folder=tmp_path)
     report = json.loads((tmp_path / "report.json").read_text())
     solver = Solver(load(name))
-    assert f"by {report['options_file']} on" in repr(solver)
+    assert f"by {report['options_file']} for" in repr(solver)
     assert solver.solve().iterations == report["iterations"]
     solver.destroy()
 

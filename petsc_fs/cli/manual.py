@@ -14,11 +14,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from petsc_fs.cli.tables import WIDTH
-
 SECTION = re.compile(r"^Options[^\n]*:\n((?: [^\n]*\n?|\n(?= ))+)", re.MULTILINE)
 ENTRY = re.compile(r"-(?P<name>[\w*]+)(?: <(?P<default>[^>]*)>)?(?: \((?P<values>[^)]*)\))?: (?P<meaning>.*)")
 PC = "petsc_fs.pc."
+WIDTH = 80
 
 
 @dataclass(frozen=True)
@@ -53,11 +52,12 @@ def own_options() -> list[Option]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ClassDef | ast.FunctionDef):
                 name = f"{PC}{node.name}" if module.startswith(PC) else f"{module}.{node.name}"
-                found += [_option(name, entry) for entry in _entries(ast.get_docstring(node) or "")]
+                found += [_option(name, entry) for entry in entries(ast.get_docstring(node) or "")]
     return found
 
 
-def _entries(docstring: str) -> Iterator[str]:
+def entries(docstring: str) -> Iterator[str]:
+    """The entries of a docstring's options, each on one line."""
     for section in SECTION.findall(docstring):
         lines = inspect.cleandoc("\n" + section)
         yield from (" ".join(entry.split()) for entry in re.split(r"\n(?=\S)", lines))
