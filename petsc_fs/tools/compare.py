@@ -600,17 +600,19 @@ def _say(line: str) -> None:
 
 
 def _print(headings: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-    """A table for a terminal of 80 columns; headings, and cells where it is needed, are broken between words."""
-    cells = [[str(c).replace("_", "_ ") for c in row] for row in (headings, *rows)]
+    """A table for a terminal of 80 columns; headings, and cells where it is needed, are broken between words.
+
+    The parts of a long name, as contact_poromechanics_fast, are words.
+    """
+    cells = [
+        [re.sub(r"\w{16,}", lambda name: name[0].replace("_", "_ "), str(c)) for c in row] for row in (headings, *rows)
+    ]
     columns = list(zip(*cells, strict=True))
     words = [max(map(len, " ".join(column).split())) for column in columns]
     widths = [max(word, *map(len, column[1:])) for word, column in zip(words, columns, strict=True)]
-    gap = "  "
-    while sum(widths) + len(gap) * (len(widths) - 1) > 80 and gap == "  ":
-        if widths == words:
-            gap = " "
-        else:
-            widths[max(range(len(widths)), key=lambda k: (widths[k] > words[k], widths[k]))] -= 1
+    gap = "  " if sum(widths) + 2 * len(widths) <= 82 else " "
+    while sum(widths) + len(widths) > 81 and widths != words:
+        widths[max(range(len(widths)), key=lambda k: (widths[k] > words[k], widths[k]))] -= 1
     for row in cells:
         parts = (textwrap.wrap(cell, width) for cell, width in zip(row, widths, strict=True))
         for line in itertools.zip_longest(*parts, fillvalue=""):
