@@ -92,7 +92,7 @@ COMMANDS = ("solve", "inspect", "compare", "sweep", "stress", "run", "export", "
         "solve model2_run.h5",
         "compare flow.h5 model1.h5 --base direct.opts --repeat 1 --options contact_poromechanics_direct.opts",
         "compare flow.h5 --rtol 1e-4..1e-8:2 --repeat 1 --out out",
-        "stress --only base",
+        "stress --only base --files direct.opts",
         "stress --list",
     ],
 )
