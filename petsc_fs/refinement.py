@@ -69,7 +69,7 @@ class Refinement:
         self._least = 1.0  # singular value of A M^-1 that GMRES has seen
         self._missed = 0.0  # by what factor a pass that met its own tolerance has missed that of a field
         self.x.set(0.0)
-        self.check = system.check(self.x, self.r)
+        self.check = system.check(None, self.r)
         size = norm(self.check.rhs)
         self.goal = max(rtol, math.ldexp(atol, system.rhs_scale) / size) if size else 1.0
         self.field_goal = rtol
@@ -106,7 +106,7 @@ class Refinement:
 
     def _correction_rtol(self) -> float:
         """Tolerance of a correction: a field that misses its own may be a small part of the residual. Collective."""
-        norms = self.system.norms(self.system.by_field(self.r))
+        (norms,) = self.system.norms(self.system.by_field(self.r))
         wanted = [MARGIN / self.missing]
         for f, e in self.check.backward.items():
             if e > self.field_goal:
@@ -206,8 +206,8 @@ class Refinement:
     def _measured(self) -> dict[str, float] | None:
         """Relative size of what a residual of this size may be worth; None if that cannot be solved for. Collective."""
         system = self.system
-        there, random = system.norms(system.by_field(self.r)), {f: scattered(system, f) for f in system.layout.fields}
-        sizes = system.norms(random)
+        random = {f: scattered(system, f) for f in system.layout.fields}
+        there, sizes = system.norms(system.by_field(self.r), random)
         parts = [v * (there[f] / (sizes[f] or 1.0)) for f, v in random.items()]
         kept, reason, found, rest = self.r.copy(), self.reason, self.d.duplicate(), self.r.duplicate()
         self.r.setArray(self.r.getArray() + np.concatenate(parts))
@@ -230,9 +230,8 @@ class Refinement:
 
     def _relative(self, part: PETSc.Vec) -> dict[str, float]:
         """Size of each field of a vector beside that of the solution, or beside what would change any equation."""
-        sizes = self.system.norms(self.system.by_field(self.x))
+        sizes, found = self.system.norms(self.system.by_field(self.x), self.system.by_field(part))
         least = self.system.least_sizes(self.check, self.field_goal)
-        found = self.system.norms(self.system.by_field(part))
         return {f: n / (max(sizes[f], least[f]) or 1.0) for f, n in found.items()}
 
     def _pass(self, rtol: float, max_it: int = 0) -> None:

@@ -302,8 +302,7 @@ class Solver:
         if not comm.bcast(known) if self._root_only else not known:
             return {}
         exact = {f: self.system.to_layout(f, reference.get(f)) for f in fields}
-        error = self.system.norms({f: solution[f] - exact[f] for f in fields})
-        size = self.system.norms(exact)
+        error, size = self.system.norms({f: solution[f] - exact[f] for f in fields}, exact)
         return {f: error[f] / (size[f] or 1.0) for f in fields}
 
     # The second solve

@@ -27,8 +27,9 @@ Pair = tuple[str, str]
 TIED = 1.0
 """Difference of exponents up to which the fields of mechanics share one."""
 ROUNDS = 50
-"""Rounds of equilibration between fields, of which there are few."""
-
+"""Rounds of equilibration between fields, of which there are few, at most."""
+BALANCED = 1e-3
+"""Largest exponent at which it ends."""
 
 EPS = 2.0**-52
 ROUNDING_UNITS = 100
@@ -117,6 +118,8 @@ class System:
         self.block_norms: dict[Pair, float] = {}
         self._near_null_space = near_null_space
         self._patterns: dict[Pair, CSR] = {}
+        ends = np.cumsum([layout.sizes(f)[0] for f in layout.fields]).tolist()
+        self._parts = {f: slice(end - layout.sizes(f)[0], end) for f, end in zip(layout.fields, ends, strict=True)}
         given = Layout.contiguous(layout.comm, layout.dimension, {f: layout.sizes(f)[1] for f in layout.fields})
         self._shares = {f: given.rows(f) for f in layout.fields}
         self._rows = {f: _Rows(layout, f, None if root_only else given.sizes(f)[0]) for f in layout.fields}
@@ -331,23 +334,24 @@ class System:
 
     def by_field(self, vector: PETSc.Vec) -> FieldArrays:
         """The local rows of each field of a vector, copied. Local."""
-        bounds = np.cumsum([self.layout.sizes(f)[0] for f in self.layout.fields])[:-1]
-        return dict(zip(self.layout.fields, np.split(vector.getArray().copy(), bounds), strict=True))
+        values = vector.getArray()
+        return {f: values[part].copy() for f, part in self._parts.items()}
 
-    def check(self, x: PETSc.Vec, r: PETSc.Vec, *, exactly: bool = False) -> Check:
+    def check(self, x: PETSc.Vec | None, r: PETSc.Vec, *, exactly: bool = False) -> Check:
         """How well x satisfies the system as it was given; sets r to the residual of the present one. Collective.
 
         Products of blocks with fields, and diagonals, bound |A| |x| from below, at the cost of one product with J.
 
         Args:
-            x: a vector like b.
+            x: a vector like b; None is zero.
             r: another one, overwritten with b - J x.
             exactly: whether |A| |x| is computed as it is, for a copy of one block at a time.
         """
-        values, rhs = self.by_field(x), self.by_field(self.b)
+        rhs = self.by_field(self.b)
         residual, terms = {f: v.copy() for f, v in rhs.items()}, {f: np.abs(v) for f, v in rhs.items()}
+        values = {} if x is None else self.by_field(x)
         with np.errstate(invalid="ignore", over="ignore"):
-            for (row, column), block in self.blocks.items():
+            for (row, column), block in self.blocks.items() if values else ():
                 product = nest.multiply(block, values[column])
                 residual[row] -= product
                 if exactly:
@@ -360,11 +364,10 @@ class System:
                     size = np.abs(product)
                 terms[row] += size
             r.setArray(np.concatenate([*residual.values()]))
-            given = [
-                self.norms({f: np.ldexp(v, -self.row_scale[f]) for f, v in part.items()})
-                for part in (residual, terms, rhs)
-            ]
-        return Check(given[0], given[1], given[2], r.norm() / (self.b.norm() or 1.0))
+            residuals, sizes, rights = self.norms(
+                *({f: np.ldexp(v, -self.row_scale[f]) for f, v in part.items()} for part in (residual, terms, rhs))
+            )
+        return Check(residuals, sizes, rights, r.norm() / (self.b.norm() or 1.0))
 
     def least_sizes(self, check: Check, tolerance: float) -> dict[str, float]:
         """Per field the size below which it changes no equation by more than a tolerance of its terms. Local."""
@@ -373,9 +376,13 @@ class System:
         }
         return {f: tolerance * min(found, default=0.0) for f, found in limits.items()}
 
-    def norms(self, arrays: Mapping[str, Floats]) -> dict[str, float]:
-        """Euclidean norm of each field over all ranks, also where squares overflow or vanish. Collective."""
-        comm, parts = self.layout.comm, [arrays[f] for f in self.layout.fields]
+    def norms(self, *vectors: Mapping[str, Floats]) -> list[dict[str, float]]:
+        """Euclidean norms of each field of vectors over all ranks, also where squares overflow or vanish.
+
+        Collective.
+        """
+        comm, fields = self.layout.comm, self.layout.fields
+        parts = [vector[f] for vector in vectors for f in fields]
         exponents = np.zeros(len(parts), dtype=int)
         with np.errstate(over="ignore", under="ignore"):
             squares = comm.allreduce(np.array([np.vdot(v, v) for v in parts]))
@@ -385,7 +392,8 @@ class System:
                 exponents = np.frexp(largest)[1]
                 parts = [np.ldexp(v, -e) for v, e in zip(parts, exponents, strict=True)]
                 squares = comm.allreduce(np.array([np.vdot(v, v) for v in parts]))
-        return dict(zip(self.layout.fields, np.ldexp(np.sqrt(squares), exponents).tolist(), strict=True))
+        found = np.ldexp(np.sqrt(squares), exponents).reshape(len(vectors), -1).tolist()
+        return [dict(zip(fields, row, strict=True)) for row in found]
 
     def gather(self, arrays: Mapping[str, Floats]) -> FieldArrays | None:
         """All rows of each field in the scene's numbering, on rank 0; None elsewhere. Collective."""
@@ -457,6 +465,8 @@ def row_exponents(sizes: Mapping[Pair, float]) -> dict[str, int]:
         rows, columns = _largest(logs, row, column)
         row = {f: row[f] - rows.get(f, 0.0) / 2 for f in row}
         column = {f: column[f] - columns.get(f, 0.0) / 2 for f in column}
+        if max(map(abs, (*rows.values(), *columns.values())), default=0.0) < BALANCED:
+            break
     mechanics = [f for f in MECHANICS if f in names]
     if len(mechanics) > 1 and np.ptp([row[f] for f in mechanics]) <= TIED:
         row |= dict.fromkeys(mechanics, float(np.mean([row[f] for f in mechanics])))

@@ -603,11 +603,7 @@ def test_every_solve_is_recorded(field_split_model, name):
 
 
 def test_iterations_and_contact_states_are_those_of_the_published_code(pp):
-    """Each solve from the same contact states takes as many iterations, and up to four more.
-
-    The published code stops in the norm of the system as it is, by an absolute tolerance of 1e-15 too; here there is
-    none, and the norm is that of the equilibrated system.
-    """
+    """Each solve from the same contact states takes as many iterations, stopped as the published code stops."""
     loader = SourceFileLoader("paper_tables", str(ROOT / "scripts" / "paper_tables"))
     script = module_from_spec(spec_from_loader("paper_tables", loader))
     loader.exec_module(script)
@@ -615,11 +611,11 @@ def test_iterations_and_contact_states_are_those_of_the_published_code(pp):
     theirs = script.COUNTS["published_code"]["runs"]["model1_g1"]
     assert (unknowns, missed, len(ours)) == (798, 0, len(theirs))
     difference, alike = script.compare(ours, theirs)
-    assert difference <= 4
+    assert difference <= 1
     assert alike >= 18
     assert [row[1:] for row in ours[0]] == [row[1:] for row in theirs[0]]
     newton, krylov = np.subtract(script.means(ours), script.means(theirs))
-    assert abs(newton) < 0.5 and 0 <= krylov < 2
+    assert abs(newton) < 0.5 and abs(krylov) < 0.5
     assert script.printed("model1_g1") == (3.5, pytest.approx(14.3))
 
 

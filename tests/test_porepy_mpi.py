@@ -34,6 +34,19 @@ class Watch:
         if len(self.states) == self.limit:
             raise StopRun
 
+class Ours(FieldSplitSolver):
+    conditions = []  # of the systems whose solution is not taken for one
+
+    def solve_linear_system(self):
+        update = super().solve_linear_system()
+        if not self.linear_solves[-1].converged:
+            A = self.linear_system[0].toarray()
+            for _ in range(20):
+                A /= np.sqrt(np.abs(A).max(axis=1, keepdims=True))
+                A /= np.sqrt(np.abs(A).max(axis=0, keepdims=True))
+            self.conditions.append(np.linalg.cond(A))
+        return update
+
 name, refinement, limit, tolerance = sys.argv[1], *map(float, sys.argv[2:])
 
 def go(mixins, **how):
@@ -42,7 +55,7 @@ def go(mixins, **how):
     run(model, nl_convergence_tol_res=tolerance, **how)
     return model
 
-ours = go((FieldSplitSolver,))
+ours = go((Ours,))
 direct = go((), linear_solve=lambda model: solve(*model.linear_system))
 adapter = Adapter(direct)
 pairs = [[adapter.from_porepy(v) for v in both] for both in zip(ours.states, direct.states, strict=True)]
@@ -51,7 +64,7 @@ found = {
         {f: np.linalg.norm(a[f] - b[f]) / np.linalg.norm(b[f]) for f in b if np.linalg.norm(b[f])} for a, b in pairs
     ],
     "ranks": sorted({s.ranks for s in ours.linear_solves}),
-    "refused": sum(not s.converged for s in ours.linear_solves),
+    "refused": ours.conditions,
     "rebuilds": ours.linear_solves[-1].rebuilds,
     "solves": len(ours.linear_solves),
 }
@@ -82,8 +95,9 @@ def test_states_are_those_of_a_direct_solver_at_every_time_step(tmp_path, name):
     (line,) = [line for line in out.splitlines() if line.startswith("RESULT")]
     found = json.loads(line.removeprefix("RESULT"))
     assert found["ranks"] == [2]
-    # in model 2 a cell sits on its friction bound to rounding: one Jacobian of the run is next to singular, and said so
-    assert found["refused"] <= (1 if name == "model2" else 0)
+    # a cell of model 2 may sit on its friction bound to rounding, and then the Jacobian is next to singular
+    assert all(condition > 1e12 for condition in found["refused"])
+    assert len(found["refused"]) <= (1 if name == "model2" else 0)
     assert len(found["differences"]) == SAME[name][1]
     for step in found["differences"]:
         assert step

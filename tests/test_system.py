@@ -154,7 +154,7 @@ def test_vectors_go_there_and_back(way, mixed):
     for f, v in (back or {}).items():
         np.testing.assert_array_equal(v, values[f])
     for factor in (1.0, 1e-200, 1e200, 0.0):
-        for f, n in system.norms({f: factor * v for f, v in local.items()}).items():
+        for f, n in system.norms({f: factor * v for f, v in local.items()})[0].items():
             assert n == pytest.approx(factor * np.linalg.norm(values[f]), rel=1e-13, abs=0.0)
 
 
