@@ -90,10 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise UsageError(
                 f"{petsc[0]}: PETSc options go with {' and '.join(TAKES_PETSC)}; options of petsc-fs have two dashes"
             )
-        if "-help" in petsc and comm.rank == 0:
-            from petsc_fs.cli import manual
-
-            print(manual.text(), flush=True)
+        _explain(petsc, comm)
         code = int(args.run(args, petsc, comm))
         if args.summary is not None:
             from petsc_fs.cli.tables import run_table
@@ -148,6 +145,14 @@ def _is_scene(word: str) -> bool:
             return os.path.isfile(word) and file.read(4) == b"\x89HDF"
     except (OSError, ValueError):
         return False
+
+
+def _explain(petsc: Sequence[str], comm: MPI.Intracomm) -> None:
+    """With -help, show the options of this package before PETSc shows its own."""
+    if "-help" in petsc and comm.rank == 0:
+        from petsc_fs.cli import manual
+
+        print(manual.text(), flush=True)
 
 
 def _fail(comm: MPI.Intracomm, message: str, code: int) -> None:
