@@ -587,6 +587,9 @@ def _level(name: str, levels: Iterable[str]) -> str:
 class Given:
     """PETSc options of a call, which must not go unused.
 
+    Options:
+        -petsc_fs_allow_unused <none> (patterns, separated by commas): options that may do nothing, such as my_*.
+
     Attributes:
         typed: names on the command line.
         values: all of them, those of options files included, in the order in which they count.

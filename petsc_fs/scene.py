@@ -127,6 +127,12 @@ class Scene:
     metadata: Metadata = field(default_factory=Metadata)
     rows: dict[str, tuple[int, int]] | None = None
 
+    def __repr__(self) -> str:
+        sizes = ", ".join(f"{f} {self.sizes[f]:,}" for f in self.fields)
+        entries = sum(block.data.size for block in self.blocks.values())
+        part = "" if self.rows is None else ", part of one rank"
+        return f"<Scene {self.metadata.model!r}, {self.dimension}D: {sizes}; {entries:,} entries{part}>"
+
     @property
     def fields(self) -> tuple[str, ...]:
         """Names of the fields present, in the order of the table."""

@@ -33,10 +33,9 @@ class Solver:
 
     Where the database chooses no preconditioner (`-pc_type`), the default options file for the scene's fields does.
 
-    Options:
-        -petsc_fs_partition, -petsc_fs_ordering: see `petsc_fs.partition.partition`.
-        -petsc_fs_retry FILE|none: options file of a second solve, where the first has not converged; its options have
-            the prefix retry_. Default none.
+    Options beside those of `petsc_fs.partition.chosen`:
+        -petsc_fs_retry <none> (an options file, none): a second solve by this file, where the first has not converged.
+        -retry_*: what -petsc_fs_retry's file has, with this prefix.
 
     Attributes:
         rtol: relative tolerance, -ksp_rtol.
@@ -100,6 +99,10 @@ class Solver:
         self._finalizer = weakref.finalize(self, _dropped.__setitem__, number, _Parts(self))
         self._finalizer.atexit = False  # where nothing collective may depend on what is alive on a rank
         self._built_seconds = time.perf_counter() - started
+
+    def __repr__(self) -> str:
+        default = self._chosen.file.name if self._chosen.file else "the smallest solver"
+        return f"<Solver by {default if self._chosen.values else 'options of the database'} for {self.layout!r}>"
 
     @property
     def rebuilds(self) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petsc_fs import options
-from petsc_fs.cli.tables import contents_table, scene_table, table
+from petsc_fs.cli.tables import contents_table, scene_table, table, wrapped
 from petsc_fs.errors import UsageError, together
 from petsc_fs.fields import learn_aliases
 from petsc_fs.io import hdf5, sequence
@@ -113,7 +113,7 @@ def contraction_text(found: Contraction) -> str:
         }
         rows = [(name, *_spread(values, found)) for name, values in violations.items()]
         parts += ["", "against its assumptions", table(["", *SPREAD], rows)]
-    return "\n".join([*parts, *(f"- {note}" for note in found.notes)])
+    return "\n".join([*parts, wrapped(f"- {note}" for note in found.notes)])
 
 
 def _spread(values: NDArray[np.float64] | None, found: Contraction) -> tuple[str, ...]:

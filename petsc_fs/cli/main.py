@@ -8,6 +8,7 @@ import io
 import locale
 import os
 import sys
+import textwrap
 import time
 import traceback
 from collections.abc import Sequence
@@ -52,9 +53,10 @@ A scene is one such system in an HDF5 file. Try, with the scenes that come along
 
   petsc-fs inspect model2.h5
   petsc-fs solve model2.h5
-  mpiexec -n 2 petsc-fs solve model3.h5 -options_file contact_poromechanics.opts -ksp_monitor
+  mpiexec -n 2 petsc-fs solve model3.h5 -ksp_rtol 1e-8 -ksp_monitor
 
-Options with two dashes are this program's; those with one dash are PETSc's and are passed on."""
+Options with two dashes are this program's; those with one dash are PETSc's and are passed on.
+petsc-fs COMMAND --help tells more, and of solve also the options of the preconditioners."""
 
 LINT_EPILOG = """\
 The solver is set up on the scene but does not run. Found are: lines PETSc would stop at, options that
@@ -104,6 +106,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise UsageError(
                 f"{petsc[0]}: PETSc options go with {' and '.join(TAKES_PETSC)}; options of petsc-fs have two dashes"
             )
+        _explain(petsc, comm)
         code = int(args.run(args, petsc, comm))
         if args.summary is not None:
             from petsc_fs.cli.tables import run_table
@@ -144,6 +147,8 @@ def split_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
         else:
             (own if option not in options.TAKE_FILES and _is_scene(word) else petsc).append(word)
             option = ""
+    if "-help" in petsc and len(own) < 2:  # no scene, of whose solver PETSc would tell
+        own.append("--help")
     return own, petsc
 
 
@@ -156,6 +161,14 @@ def _is_scene(word: str) -> bool:
             return os.path.isfile(word) and file.read(4) == b"\x89HDF"
     except (OSError, ValueError):
         return False
+
+
+def _explain(petsc: Sequence[str], comm: MPI.Intracomm) -> None:
+    """With -help, show the options of this package before PETSc shows its own."""
+    if "-help" in petsc and comm.rank == 0:
+        from petsc_fs.cli import manual
+
+        print(manual.text(), flush=True)
 
 
 def _fail(comm: MPI.Intracomm, message: str, code: int) -> None:
@@ -182,21 +195,46 @@ def _describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}{where}"
 
 
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """Paragraphs filled to the width of the terminal, and lines that begin with a space as they are."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        parts: list[str] = []
+        for line in text.splitlines():
+            if parts and line and parts[-1] and not line.startswith(" ") and not parts[-1].startswith(" "):
+                parts[-1] += f" {line}"
+            else:
+                parts.append(line)
+        return "\n".join(
+            textwrap.fill(
+                part, width, subsequent_indent="      " if part.startswith(" ") else "", break_on_hyphens=False
+            )
+            for part in parts
+        )
+
+
 class _Parser(argparse.ArgumentParser):
-    """One line on a wrong call, as for any other error."""
+    """One line on a wrong call, as for any other error; help with the options of this package."""
+
+    def format_help(self) -> str:
+        found = super().format_help()
+        if self.prog.split()[-1] not in TAKES_PETSC:
+            return found
+        from petsc_fs.cli import manual
+
+        return f"{found}\n{manual.text()}\n"
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message}; see {self.prog} --help")
 
 
 def _parser(command: list[str]) -> argparse.ArgumentParser:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = _Parser(prog="petsc-fs", description=DESCRIPTION, formatter_class=raw)
+    parser = _Parser(prog="petsc-fs", description=DESCRIPTION, formatter_class=_Help)
     parser.set_defaults(summary=None, close=None)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def add(name: str, summary: str, run: Any, **more: Any) -> argparse.ArgumentParser:
-        sub = commands.add_parser(name, help=summary, description=summary, formatter_class=raw, **more)
+        sub = commands.add_parser(name, help=summary, description=summary, formatter_class=_Help, **more)
         sub.set_defaults(run=run)
         return sub
 

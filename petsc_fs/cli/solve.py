@@ -34,13 +34,12 @@ TOTALS = ("iterations", "read_seconds", "setup_seconds", "solve_seconds")
 
 EPILOG = """\
 PETSc options follow the scene, for example
-  -options_file FILE     an options file of yours, or the name of a shipped one
-  -ksp_rtol 1e-6         relative tolerance      -ksp_monitor   residual at each iteration
-  -ksp_view              the solver tree         -log_view      where time goes
-  -petsc_fs_retry FILE   options file for a second solve, where the first one fails
-  -petsc_fs_partition rcb    which rank gets which cells: auto, rcb, ptscotch or contiguous
-  -petsc_fs_ordering morton  order of the cells of a rank: auto, natural (that of the file), or along a curve
-  -petsc_fs_allow_unused my_*   names of options that may do nothing
+  -options_file FILE   an options file of yours, or the name of a shipped one
+  -ksp_rtol 1e-6       relative tolerance
+  -ksp_monitor         residual at each iteration
+  -ksp_view            the solver tree
+  -log_view            where time goes
+  -help                what PETSc knows of the solver at hand
 
 exit codes: 0 converged, by the residual of the system in the file; 1 not converged, or the solve
 failed; 2 wrong call or option; 3 a scene that cannot be read or does not fit together"""
