@@ -36,7 +36,7 @@ DETERMINED = 1e-3
 ACCEPTED = 1e-2
 """The same where rounding allows no better one."""
 BALANCED = 1e-6
-"""Imbalance of a field from which a solution is in doubt."""
+"""Imbalance of a field from which a solution is in doubt, unless a third of the tolerance is more."""
 NOISE = 2.0
 """Size of a perturbation beside the residual."""
 FAR = 10.0
@@ -191,7 +191,7 @@ class Refinement:
             return
         seen = self.ksp.getType() in (*HESSENBERG, PETSc.KSP.Type.PREONLY)  # how good the preconditioner is
         doubtful = not seen or self._missed > FAR or not self.reason.startswith("CONVERGED")
-        doubtful = doubtful or max(self.system.imbalance(self.x, self.r).values()) > BALANCED
+        doubtful = doubtful or max(self.system.imbalance(self.x, self.r).values()) > max(BALANCED, self.rtol / 3)
         for _ in range(MOST_IMPROVEMENTS):
             self._precondition()
             steps, eta = self._relative(self.d), max(self.check.backward.values())
