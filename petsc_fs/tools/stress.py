@@ -17,8 +17,7 @@ import os
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -64,44 +63,26 @@ RETRY = "(default, retry)"
 """The same with -petsc_fs_retry retry.opts."""
 
 
-@dataclass(frozen=True)
-class Truth:
-    """What is known of a case before anything is solved; see `petsc_fs.tools.stress_cases.StressCase` for the rest."""
+Case = dict[str, Any]
+"""What is known of a case before anything is solved, as JSON can hold it: what `StressCase` says of it in words, and
 
-    name: str
-    group: str
-    hard: str
-    source: str
-    fields: tuple[str, ...]  # of the scene
-    unknowns: int  # number of them
-    path: str  # of the scene
-    reference: str  # file of the reference solution; "" if there is none
-    no_reference: str  # why
-    conditions: dict[str, float]  # see `petsc_fs.tools.reference.field_conditions`
-    singular: bool
-    solvable: bool = True
-    held_out: bool = False
+    fields, unknowns     of the scene, and their number
+    conditions           of each field, see `petsc_fs.tools.reference.field_conditions`
+    no_reference         why there is no reference solution; "" if there is one
+    path, reference      files of the scene and of the reference, "" if there is none or no single one; not reported
+"""
 
+Finding = dict[str, Any]
+"""What came of one case with one options file on some ranks; as `petsc_fs.tools.measure` has it, but for
 
-@dataclass(frozen=True)
-class Finding:
-    """What came of one case with one options file on some ranks."""
-
-    case: str  # its name
-    file: str  # name of the options file, or DEFAULT or RETRY
-    ranks: int
-    outcome: str  # one of OUTCOMES
-    kind: str  # of `petsc_fs.tools.measure.KINDS`
-    message: str  # what was said
-    iterations: int | None  # of the outer Krylov method
-    reason: str | None  # why it stopped
-    error_by_field: dict[str, float] | None  # relative, in natural norms
-    backward_error: dict[str, float] | None  # normwise, componentwise and fieldwise
-    allowed_by_field: dict[str, float]  # the largest errors that count as right
-    seconds: float | None  # set-up and solve
+    case, file           names; file may be DEFAULT or RETRY
+    outcome              one of OUTCOMES
+    allowed_by_field     the largest errors that count as right
+    seconds              set-up and solve
+"""
 
 
-def prepare(cases: Iterable[StressCase], folder: Path) -> list[Truth]:
+def prepare(cases: Iterable[StressCase], folder: Path) -> list[Case]:
     """Write the scenes, with reference solutions and condition numbers. Initialises PETSc; on one rank."""
     import petsc4py
 
@@ -112,21 +93,19 @@ def prepare(cases: Iterable[StressCase], folder: Path) -> list[Truth]:
     for case in cases:
         scene = case.make()
         path = hdf5.write(scene, folder / f"{case.name}.h5", compression=None)
-        target, why, conditions = "", "", dict[str, float]()
+        known = {name: getattr(case, name) for name in "name group hard source singular solvable held_out".split()}
+        known |= {"fields": scene.fields, "unknowns": sum(scene.sizes.values()), "path": os.fspath(path)}
+        known |= {"reference": "", "no_reference": "", "conditions": {}}
         try:
             with np.errstate(all="ignore"):  # what is not finite is looked for
                 exact = reference.solve(scene, "direct")
-                target = os.fspath(folder / f"{case.name}.npz")
+                target = folder / f"{case.name}.npz"
                 reference.write(exact, target)
-                conditions = reference.field_conditions(scene, exact.solution)
+                known["reference"] = "" if case.singular else os.fspath(target)
+                known["conditions"] = reference.field_conditions(scene, exact.solution)
         except (SolveError, FloatingPointError) as e:
-            why = str(e)
-        same: dict[str, Any] = {
-            name: getattr(case, name) for name in "name group hard source singular solvable held_out".split()
-        }
-        known: dict[str, Any] = {"fields": scene.fields, "unknowns": sum(scene.sizes.values()), "path": os.fspath(path)}
-        target = "" if case.singular else target
-        found.append(Truth(**same, **known, reference=target, no_reference=why, conditions=conditions))
+            known["no_reference"] = str(e)
+        found.append(known)
     return found
 
 
@@ -138,74 +117,67 @@ def variants(more: Mapping[str, str | None]) -> list[Variant]:
 
 
 def run(
-    truths: Sequence[Truth],
+    cases: Sequence[Case],
     chosen: Sequence[Variant],
     *,
     ranks: Sequence[int] = (1,),
     time_limit: float = 60.0,
     mpiexec: str | None = None,
-    say: Callable[[str], None] = lambda line: None,
 ) -> Iterator[Finding]:
     """Solve every case by every variant that fits, on every number of ranks, one process at a time.
 
     A process goes on from scene to scene; after one that ended by an error another process takes the rest.
     """
-    by_path = {t.path: t for t in truths}
-    references = {t.path: t.reference for t in truths if t.reference}
+    by_path = {case["path"]: case for case in cases}
+    references = {path: case["reference"] for path, case in by_path.items() if case["reference"]}
     job = Job(errors=True, references=references, time_limit=time_limit, keep_going=True)
 
     def fits(system: str, variant: Variant) -> bool:
-        return variant.fits(by_path[system].fields)
+        return variant.fits(by_path[system]["fields"])
 
-    processes = measure_all(list(by_path), chosen, job, ranks=ranks, fits=fits, batch=True, mpiexec=mpiexec)
-    for records in processes:
+    for records in measure_all(list(by_path), chosen, job, ranks=ranks, fits=fits, batch=True, mpiexec=mpiexec):
         found = [judge(by_path[record["scene"]], record) for record in records]
-        numbers = Counter(f.outcome for f in found)
-        words = ", ".join(f"{n} {outcome}" for outcome, n in numbers.items())
-        say(f"{found[0].file} on {found[0].ranks} rank{'s' if found[0].ranks > 1 else ''}: {words}")
+        words = ", ".join(f"{n} {outcome}" for outcome, n in Counter(f["outcome"] for f in found).items())
+        _say(f"{found[0]['file']}{_on(found[0]['ranks'])}: {words}")
         yield from found
 
 
-def judge(truth: Truth, record: Record) -> Finding:
+def judge(case: Case, record: Record) -> Finding:
     """What a record of `petsc_fs.tools.measure.measure_all` amounts to."""
-    allowed = {f: UNCONDITIONED for f in truth.fields}
-    allowed |= {f: min(WORST, SAFETY * TOLERANCE * max(c, 1.0)) for f, c in truth.conditions.items()}
+    allowed = dict.fromkeys(case["fields"], UNCONDITIONED)
+    allowed |= {f: min(WORST, SAFETY * TOLERANCE * max(c, 1.0)) for f, c in case["conditions"].items()}
     errors, kind = record["error_by_field"], record["kind"]
     if kind in ("hang", "crash"):
         outcome = kind
     elif kind != "converged":
         outcome = "refusal"
-    elif not truth.solvable:
+    elif not case["solvable"]:
         outcome = "wrong"
-    elif errors is not None and truth.reference:
+    elif errors is not None and case["reference"]:
         outcome = "right" if all(errors[f] <= allowed[f] for f in errors) else "wrong"
     else:
         backward = (record["backward_error"] or {}).get("fieldwise", np.inf)
         outcome = "right" if backward <= SINGULAR_BACKWARD else "wrong"
     said = {key: record[key] for key in "ranks kind message iterations reason error_by_field backward_error".split()}
     seconds = None if record["seconds"] is None else seconds_of(record)["total"]
-    return Finding(truth.name, record["variant"], outcome=outcome, allowed_by_field=allowed, seconds=seconds, **said)
+    about = {"case": case["name"], "file": record["variant"], "outcome": outcome}
+    return about | said | {"allowed_by_field": allowed, "seconds": seconds}
 
 
-def report(truths: Sequence[Truth], findings: Sequence[Finding], command: str) -> dict[str, Any]:
-    """Everything, for JSON."""
-    cases = [{k: v for k, v in asdict(t).items() if k not in ("path", "reference")} for t in truths]
-    return _counted({"command": command, "cases": cases, "findings": [asdict(f) for f in findings]})
-
-
-def _counted(found: dict[str, Any]) -> dict[str, Any]:
-    """With the number of each outcome by number of ranks."""
-    numbers = sorted({f["ranks"] for f in found["findings"]})
-    counts = {str(n): dict(Counter(f["outcome"] for f in found["findings"] if f["ranks"] == n)) for n in numbers}
-    return found | {"counts": counts}
+def report(cases: Iterable[Case], findings: Iterable[Finding], command: str) -> dict[str, Any]:
+    """Everything, for JSON, with the number of each outcome by number of ranks."""
+    known = [{k: v for k, v in case.items() if k not in ("path", "reference")} for case in cases]
+    found = list(findings)
+    numbers = sorted({f["ranks"] for f in found})
+    counts = {str(n): dict(Counter(f["outcome"] for f in found if f["ranks"] == n)) for n in numbers}
+    return {"command": command, "cases": known, "findings": found, "counts": counts}
 
 
 def merge(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Several reports as one; where two have the same case, file and ranks, the later one counts."""
     cases = {case["name"]: case for part in parts for case in part["cases"]}
     latest = {(f["file"], f["ranks"], f["case"]): f for part in parts for f in part["findings"]}
-    command = "; ".join(dict.fromkeys(p["command"] for p in parts))
-    return _counted({"command": command, "cases": list(cases.values()), "findings": list(latest.values())})
+    return report(cases.values(), latest.values(), "; ".join(dict.fromkeys(p["command"] for p in parts)))
 
 
 def read_report(path: Path) -> dict[str, Any]:
@@ -345,19 +317,19 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
             if name not in known:
                 raise UsageError(f"no options file {name!r}; there are {', '.join(known)}")
         with tempfile.TemporaryDirectory(prefix="petsc_fs-stress-") as folder:
-            truths = prepare(cases, Path(folder))
-            _say(f"{len(truths)} scenes, {sum(bool(t.reference) for t in truths)} with a reference solution")
-            how: dict[str, Any] = {"time_limit": args.time_limit, "mpiexec": args.mpiexec, "say": _say}
-            findings = list(run(truths, [known[n] for n in args.files or known], ranks=ranks, **how))
+            prepared = prepare(cases, Path(folder))
+            _say(f"{len(prepared)} scenes, {sum(bool(c['reference']) for c in prepared)} with a reference solution")
+            how: dict[str, Any] = {"time_limit": args.time_limit, "mpiexec": args.mpiexec}
+            findings = list(run(prepared, [known[n] for n in args.files or known], ranks=ranks, **how))
         words = f"--only {' '.join(args.only)}" if args.only else f"--suite {args.suite}"
-        found = report(truths, findings, f"petsc-fs stress {words} --ranks {' '.join(map(str, ranks))}")
+        found = report(prepared, findings, f"petsc-fs stress {words} --ranks {' '.join(map(str, ranks))}")
     if args.report is not None:
         write_text(args.report, json.dumps(found, indent=1) + "\n")
     if args.page is not None:
         write_page(found, args.page)
     bad = [f for f in found["findings"] if f["outcome"] not in ("right", "refusal")]
     for finding in bad:
-        _say(f"{finding['outcome'].upper()}: {describe(Finding(**finding))}")
+        _say(f"{finding['outcome'].upper()}: {describe(finding)}")
     for n, counts in found["counts"].items():
         _say(f"{n} rank{'s' if n != '1' else ''}: " + ", ".join(f"{counts.get(o, 0)} {o}" for o in OUTCOMES))
     seconds = time.perf_counter() - started
@@ -367,12 +339,11 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
 
 def describe(finding: Finding) -> str:
     """One line on what is wrong with a finding."""
-    worst = ""
-    if finding.error_by_field:
-        off = {f: e for f, e in finding.error_by_field.items() if not e <= finding.allowed_by_field.get(f, np.inf)}
-        worst = ", ".join(f"{f} {e:.1e} (allowed {finding.allowed_by_field[f]:.1e})" for f, e in off.items())
-    where = f"{finding.case} by {finding.file} on {finding.ranks}"
-    return f"{where}: {finding.kind} {finding.reason or ''} {finding.message} {worst}".rstrip()
+    allowed, errors = finding["allowed_by_field"], finding["error_by_field"] or {}
+    off = {f: e for f, e in errors.items() if not e <= allowed.get(f, np.inf)}
+    worst = ", ".join(f"{f} {e:.1e} (allowed {allowed[f]:.1e})" for f, e in off.items())
+    where = f"{finding['case']} by {finding['file']} on {finding['ranks']}"
+    return f"{where}: {finding['kind']} {finding['reason'] or ''} {finding['message']} {worst}".rstrip()
 
 
 def _chosen(args: argparse.Namespace) -> list[StressCase]:
@@ -391,6 +362,10 @@ def _chosen(args: argparse.Namespace) -> list[StressCase]:
     if args.suite == "held-out":
         return [case for case in known.values() if case.held_out]
     return [case for case in known.values() if args.suite == "full" or case.quick]
+
+
+def _on(ranks: int) -> str:
+    return f" on {ranks} rank{'s' if ranks > 1 else ''}"
 
 
 def _say(line: str) -> None:
