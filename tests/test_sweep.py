@@ -102,7 +102,7 @@ def test_parameters_exist_where_their_conditions_hold(tmp_path: Path) -> None:
 
 
 def test_grid_has_each_combination_of_existing_parameters_once(tmp_path: Path) -> None:
-    grid = list(make(tmp_path).grid())
+    grid = make(tmp_path).grid()
     # gmres: 3 restarts · (3 divtol + 2 overlaps) · (2 levels + jacobi); fgmres: 3 · 5 · 2; bcgs: 5 · 2
     assert len(grid) == 3 * 5 * 3 + 3 * 5 * 2 + 5 * 2
     assert len({json.dumps(values) for values in grid}) == len(grid)
@@ -193,7 +193,7 @@ A = "base: base.opts\ngroups:\n  a:\n    parameters:\n      "
         (A + "x: {integer: [0.5, 2]}", "expected whole numbers, found [0.5, 2]; or take 'float'"),
         (A + "x: {integer: [1, 9], step: 0.5}", "step: expected a positive number, found 0.5"),
         (A + "x: {log: [0, 1]}", "values must be positive, found 0; take 'float'"),
-        (A + "x: {float: [0, 1], start: 2}", "start 2 is outside of [0, 1]"),
+        (A + "x: {float: [0, 1], start: 2}", "start 2 is no number in [0, 1]"),
         (A + "x: {float: [0, 1], points: 1}", "a grid needs both ends"),
         (A + "'x y': {float: [0, 1]}", "'x y' is no name of an option"),
         (A + "x: {float: [0, 1], when: {y: 1}}", "there is no parameter a.y before this one; declare it before"),
@@ -447,7 +447,7 @@ def test_trial_that_was_measured_but_not_ended_is_not_repeated(
         tell = Sweep._tell
 
         def interrupted(sweep: Sweep, attempt: Any) -> None:
-            if attempt.number == 2:
+            if attempt["number"] == 2:
                 raise KeyboardInterrupt
             tell(sweep, attempt)
 
@@ -575,7 +575,7 @@ def test_results_without_a_solved_trial_are_written_all_the_same(tmp_path: Path,
         (["flow.h5", "--space", "nothing"], 2, "space nothing: no such file; shipped are amg.yaml, flow.yaml"),
         (["model1.h5", "--space", "flow"], 2, "model1.h5: flow.opts is for scenes with the fields intf_flow, mass"),
         (["flow.h5", "flow.h5", "--space", "flow"], 2, "flow.h5: named twice"),
-        (["flow.h5", "--space", "flow", "--trials", "0"], 2, "--trials 0: expected a positive number"),
+        (["flow.h5", "--space", "flow", "--trials", "0"], 2, "--trials: expected a positive number, found 0"),
         (["flow.h5", "--space", "flow", "--patience", "0.5"], 2, "--patience 0.5: expected at least 1, or 0 for never"),
         (["flow.h5", "--space", "flow", "--rtol", "2"], 2, "--rtol 2: expected a number between 0 and 1"),
         (["none.h5", "--space", "flow"], 3, "none.h5: no such file"),

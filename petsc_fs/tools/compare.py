@@ -8,6 +8,7 @@ of each scene is computed first, in a process of its own, see `petsc_fs.tools.re
 from __future__ import annotations
 
 import argparse
+import base64
 import csv
 import io
 import itertools
@@ -17,9 +18,11 @@ import re
 import signal
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from html import escape
 from pathlib import Path
+from statistics import geometric_mean, median
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -35,9 +38,13 @@ from petsc_fs.tools.measure import (
     describe_machine,
     grown,
     measure_all,
+    positive,
+    refuse_twice,
+    say,
     seconds_of,
     split_ranks,
 )
+from petsc_fs.tools.pages import hypertext
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -147,7 +154,7 @@ class Point:
     iterations: float
     error: float  # forward error; NaN where there is no reference
     residual: float  # true residual
-    seconds: dict[str, Spread]  # of "read", "setup", "solve", and "total" of the last two
+    seconds: dict[str, Spread]  # of "setup", "solve", and "total" of both
     ratios: dict[str, Spread]  # of "setup", "solve" and "total" to those of the base file in the same round
     memory: float  # bytes that all ranks' memory grew by
 
@@ -158,14 +165,16 @@ def points(found: Comparison) -> list[Point]:
     groups: dict[tuple[Any, ...], dict[int, Record]] = {}
     for r in found.records:
         groups.setdefault((r["scene"], r["ranks"], r["rtol"], r["variant"]), {})[r["round"]] = r
+    ended = {key: {k: r for k, r in runs.items() if r["kind"] in ENDED} for key, runs in groups.items()}
     rows = []
     for (scene, ranks, rtol, file), runs in groups.items():
-        good = {k: r for k, r in runs.items() if r["kind"] in ENDED}
+        good = ended[scene, ranks, rtol, file]
         if not good:
             continue
-        base = groups.get((scene, ranks, rtol, found.base), {})
+        base = ended.get((scene, ranks, rtol, found.base), {})
         mine = {k: seconds_of(r, found.clock) for k, r in good.items()}
-        theirs = {k: seconds_of(base[k], found.clock) for k in mine if k in base and base[k]["kind"] in ENDED}
+        theirs = {k: seconds_of(base[k], found.clock) for k in mine if k in base}
+        ratios = {what: [mine[k][what] / s[what] for k, s in theirs.items()] for what in ("setup", *SECONDS)}
         errors = [r["forward_error"] for r in good.values() if r["forward_error"] is not None]
         rows.append(
             Point(
@@ -175,16 +184,12 @@ def points(found: Comparison) -> list[Point]:
                 rtol=rtol,
                 ended=len(good) == len(runs),
                 converged=all(r["kind"] == "converged" for r in runs.values()),
-                iterations=float(np.median([r["iterations"] for r in good.values()])),
-                error=float(np.median(errors)) if errors else float("nan"),
-                residual=float(np.median([r["true_residual"] for r in good.values()])),
-                seconds={what: Spread.of([s[what] for s in mine.values()]) for what in ("read", "setup", *SECONDS)},
-                ratios={
-                    what: Spread.of([mine[k][what] / s[what] for k, s in theirs.items()])
-                    for what in ("setup", *SECONDS)
-                    if theirs
-                },
-                memory=float(np.median([grown(r) for r in good.values()])),
+                iterations=median(r["iterations"] for r in good.values()),
+                error=median(errors) if errors else float("nan"),
+                residual=median(r["true_residual"] for r in good.values()),
+                seconds={what: Spread.of([s[what] for s in mine.values()]) for what in ("setup", *SECONDS)},
+                ratios={what: Spread.of(values) for what, values in ratios.items() if values},
+                memory=median(map(grown, good.values())),
             )
         )
     return rows
@@ -239,19 +244,9 @@ def summary(found: Comparison, everything: Sequence[Point]) -> list[list[object]
 
 
 SUMMARY = ("scene", "ranks", "error ≤", *SECONDS.values())
-MEDIANS = "file,ranks,tolerance,iterations,true residual,forward error,set-up (s),solve (s),".split(",")
-RATIOS = (
-    "scene",
-    "ranks",
-    "file",
-    "iterations",
-    "set-up, s",
-    "solve, s",
-    "set-up ratio",
-    "solve ratio",
-    "ratio",
-    "MiB",
-)
+MEDIANS = "file;ranks;tolerance;iterations;true residual;forward error;set-up (s);solve (s);".split(";")
+RATIOS = "scene;ranks;file;iterations;set-up, s;solve, s;set-up ratio;solve ratio;ratio;MiB".split(";")
+FAILURES = "scene;file;ranks;outcome;runs;said".split(";")
 
 
 def ratio_rows(found: Comparison, everything: Sequence[Point]) -> list[list[object]]:
@@ -269,7 +264,7 @@ def ratio_rows(found: Comparison, everything: Sequence[Point]) -> list[list[obje
         rows.append([scene, p.ranks, file, f"{p.iterations:g}", *seconds, *ratios, f"{p.memory / 2**20:.3g}"])
     for (ranks, file), values in sorted(means.items()):
         if file != found.base:
-            mean = f"{np.exp(np.mean(np.log(values))):.2f}, worst {max(values):.2f}"
+            mean = f"{geometric_mean(values):.2f}, worst {max(values):.2f}"
             rows.append(["geometric mean", ranks, file, *[""] * 5, mean, ""])
     return rows
 
@@ -348,61 +343,54 @@ not decide."""
 
 def page(found: Comparison, everything: Sequence[Point], pictures: Mapping[str, Path]) -> str:
     """The page: summary, pictures by label of the scene, and how it was measured; it refers to no other file."""
-    import base64
-    import html
-
-    from petsc_fs.tools.pages import hypertext
-
-    title = f"Comparison: {', '.join(case.label for case in found.cases)}"
+    title = escape(f"Comparison: {', '.join(case.label for case in found.cases)}")
     lines = [
-        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>',
-        f"<style>{STYLE}</style></head><body><h1>{html.escape(title)}</h1>",
+        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>',
+        f"<style>{STYLE}</style></head><body><h1>{title}</h1>",
     ]
     if not found.about["complete"]:
         lines.append("<p><b>Measuring was interrupted:</b> later rounds or combinations are missing.</p>")
     if found.base:
-        lines += [f"<h2>Against {html.escape(found.base)}</h2>", hypertext(RATIOS, ratio_rows(found, everything))]
-    best = summary(found, everything)
-    if best:
+        lines += [f"<h2>Against {escape(found.base)}</h2>", hypertext(RATIOS, ratio_rows(found, everything))]
+    if best := summary(found, everything):
         lines += ["<h2>Which file is fastest for which accuracy</h2>", hypertext(SUMMARY, best)]
     for case in found.cases:
-        sizes = ", ".join(f"{name} {size:,}" for name, size in case.sizes.items())
-        steps = f"{case.steps} steps; " if case.steps else ""
-        about = f"{case.model}, {case.dimension}D; {steps}{sum(case.sizes.values()):,} unknowns: {sizes}."
-        lines += [
-            f"<h2>{html.escape(case.label)}</h2>",
-            f"<p>{html.escape(about)}</p>",
-        ]
-        if case.label in pictures:
-            data = base64.b64encode(pictures[case.label].read_bytes()).decode("ascii")
-            lines.append(f'<img alt="Error against seconds" src="data:image/svg+xml;base64,{data}">')
-        if case.reference:
-            words = f"{case.reference['method']}; last correction {case.reference['corrections'][-1]:.0e}, "
-            words += f"componentwise backward error {case.reference['backward_error']['componentwise']:.0e}"
-            lines.append(f"<p>Reference: {html.escape(words)}.</p>")
-        rows = [
-            (
-                *(p.file, p.ranks, "its own" if p.rtol is None else f"{p.rtol:.0e}", f"{p.iterations:g}"),
-                *(f"{p.residual:.1e}", f"{p.error:.1e}", p.seconds["setup"], p.seconds["solve"]),
-                "" if p.converged else "missed the tolerance" if p.ended else "failed in some rounds",
-            )
-            for p in everything
-            if p.scene == case.label
-        ]
-        lines.append(f"<details><summary>All medians</summary>{hypertext(MEDIANS, rows)}</details>")
+        lines += _about_case(case, [p for p in everything if p.scene == case.label], pictures.get(case.label))
     failed = failures(found)
     lines.append("<h2>What did not converge</h2>")
-    heads = ("scene", "file", "ranks", "outcome", "runs", "said")
-    lines.append(hypertext(heads, failed) if failed else "<p>Every solve met its tolerance.</p>")
+    lines.append(hypertext(FAILURES, failed) if failed else "<p>Every solve met its tolerance.</p>")
     facts = [[k, f"{v:.3g}" if isinstance(v, float) else v] for k, v in found.about.items()]
     facts.append(["seconds are", f"{CLOCKS[found.clock]} of the slowest rank"])
     lines += ["<h2>How this was measured</h2>", f"<p>{METHOD}</p>", hypertext(("", ""), facts)]
     for variant in found.variants:
         more = "".join(f"-{k} {v or ''}\n" for k, v in variant.options.items())
-        head = f"<code>{html.escape(variant.label)}</code>: {html.escape(variant.purpose)}"
-        text = html.escape(more + variant.text)
-        lines.append(f"<details><summary>{head}</summary><pre>{text}</pre></details>")
+        head = f"<code>{escape(variant.label)}</code>: {escape(variant.purpose)}"
+        lines.append(f"<details><summary>{head}</summary><pre>{escape(more + variant.text)}</pre></details>")
     return "\n".join([*lines, "</body></html>"]) + "\n"
+
+
+def _about_case(case: Case, mine: Sequence[Point], picture: Path | None) -> Iterator[str]:
+    """The part of the page on one scene."""
+    sizes = ", ".join(f"{name} {size:,}" for name, size in case.sizes.items())
+    steps = f"{case.steps} steps; " if case.steps else ""
+    about = f"{case.model}, {case.dimension}D; {steps}{sum(case.sizes.values()):,} unknowns: {sizes}."
+    yield from (f"<h2>{escape(case.label)}</h2>", f"<p>{escape(about)}</p>")
+    if picture is not None:
+        data = base64.b64encode(picture.read_bytes()).decode("ascii")
+        yield f'<img alt="Error against seconds" src="data:image/svg+xml;base64,{data}">'
+    if case.reference:
+        words = f"{case.reference['method']}; last correction {case.reference['corrections'][-1]:.0e}, "
+        words += f"componentwise backward error {case.reference['backward_error']['componentwise']:.0e}"
+        yield f"<p>Reference: {escape(words)}.</p>"
+    rows = [
+        (
+            *(p.file, p.ranks, "its own" if p.rtol is None else f"{p.rtol:.0e}", f"{p.iterations:g}"),
+            *(f"{p.residual:.1e}", f"{p.error:.1e}", p.seconds["setup"], p.seconds["solve"]),
+            "" if p.converged else "missed the tolerance" if p.ended else "failed in some rounds",
+        )
+        for p in mine
+    ]
+    yield f"<details><summary>All medians</summary>{hypertext(MEDIANS, rows)}</details>"
 
 
 def draw(found: Comparison, everything: Sequence[Point], out: Path) -> dict[str, Path]:
@@ -413,13 +401,11 @@ def draw(found: Comparison, everything: Sequence[Point], out: Path) -> dict[str,
     ranks = min(found.ranks)
     for case in found.cases:
         mine = [p for p in everything if p.scene == case.label and p.ranks == ranks and p.error == p.error]
-        if not mine:
-            continue
         curves: dict[str, dict[str, list[tuple[float, float]]]] = {heading: {} for heading in SECONDS.values()}
         for (what, heading), p in itertools.product(SECONDS.items(), mine):
             curves[heading].setdefault(p.file, []).append((p.seconds[what].median, p.error))
         where = f"{case.label} on {ranks} rank{'s' if ranks > 1 else ''}"
-        for suffix in ("png", "svg"):
+        for suffix in ("png", "svg") if mine else ():
             target = out / f"work_precision_{case.label}.{suffix}"
             pictures[case.label] = plot_work_precision(curves, target, where, CLOCKS[found.clock])
     return pictures
@@ -435,7 +421,7 @@ Reference solutions are kept in --out and used again. An options file may be fol
 Single-dash options are PETSc's and go to every run (-n RANKS is the exception).
 
   petsc-fs compare model1.h5 model2.h5 --repeat 3 --out comparison
-  petsc-fs compare mine.h5 --options direct.opts "mine.opts -ksp_max_it 50" --rtol 1e-2..1e-10:2 -n 1 2 --out comparison
+  petsc-fs compare mine.h5 --options direct.opts "mine.opts -ksp_max_it 50" --rtol 1e-2..1e-10:2 --ranks 1 2 --out x
   petsc-fs compare mine.h5 run.h5 --base contact_poromechanics.opts --options mine.opts --repeat 5
   petsc-fs compare --again comparison/compare.json --out comparison     # pictures and page only
 
@@ -451,16 +437,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--base", metavar="FILE", help="options file whose seconds the others' are set against, in the same round")
     add("--rtol", metavar="A..B", help=f"tolerances, every decade, or a list with commas; default {RTOLS}, and with "
         "--base those of the files, without errors")  # fmt: skip
-    add("--ranks", type=int, nargs="+", metavar="N", help="numbers of ranks; default 1")
-    add("--repeat", type=int, default=5, metavar="N", help="rounds, default %(default)s")
+    add("--ranks", type=positive(int), nargs="+", metavar="N", help="numbers of ranks; default 1")
+    add("--repeat", type=positive(int), default=5, metavar="N", help="rounds, default %(default)s")
     add("--out", type=Path, metavar="DIR", help="folder to write, made if missing; with --base it may be left away")
-    add(
-        "--time-limit",
-        type=float,
-        default=300.0,
-        metavar="S",
-        help="seconds for a set-up or solve, default %(default)g",
-    )
+    add("--time-limit", type=positive(float), default=300.0, metavar="S", help="seconds for a set-up or solve, default "
+        "%(default)g")  # fmt: skip
     add("--clock", choices=CLOCKS, help="what seconds are; cpu: processor time, for a machine where others compute")
     add("--mpiexec", metavar="PROGRAM", help="that starts ranks; default MPIEXEC or the one on PATH")
     add("--again", type=Path, metavar="FILE.json", help="draw from an earlier comparison instead")
@@ -470,7 +451,7 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
     """Run `petsc-fs compare`."""
     if comm.size > 1:
         raise UsageError("compare starts mpiexec itself: call it without, and give it -n RANKS")
-    if args.out is None and not args.base:
+    if args.out is None and (args.again or not args.base):
         raise UsageError("--out: name the folder to write")
     if args.out is not None:
         from petsc_fs.tools.plots import pyplot
@@ -489,8 +470,7 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
     everything = points(found)
     if found.base:
         _print(RATIOS, ratio_rows(found, everything))
-    best = summary(found, everything)
-    if best:
+    if best := summary(found, everything):
         _print(SUMMARY, best)
     if args.out is not None:
         pictures = draw(found, everything, args.out)
@@ -511,12 +491,9 @@ def _measure(args: argparse.Namespace, petsc: list[str]) -> Comparison:
     rtols = () if args.base and not args.rtol else rtols_of(args.rtol or RTOLS)
     if not args.scenes:
         raise UsageError("name at least one scene; they come before --options")
-    if min(ranks) < 1 or args.repeat < 1 or args.time_limit <= 0:
-        raise UsageError("--ranks, --repeat and --time-limit must be positive")
     cases = [Case.of(path) for path in dict.fromkeys(find_scene(name) for name in args.scenes)]
     variants = _variants(args.options, args.base, cases, more)
-    _unique("scenes", [case.label for case in cases])
-    _unique("options files", [variant.label for variant in variants])
+    refuse_twice("scenes", [case.label for case in cases])
     if args.out is not None:
         _make_folder(args.out)
     started, complete, records = time.time(), True, list[Record]()
@@ -526,7 +503,7 @@ def _measure(args: argparse.Namespace, petsc: list[str]) -> Comparison:
     try:
         for k, case in enumerate(cases if rtols and args.out is not None else ()):
             if not case.steps:
-                _say(f"reference solution of {case.label}")
+                say(f"reference solution of {case.label}")
                 references[case.path] = os.fspath(args.out / f"reference_{case.label}.npz")
                 cases[k] = replace(case, reference=reference.made(case.path, Path(references[case.path])).about())
         for found in measure_all(
@@ -541,7 +518,7 @@ def _measure(args: argparse.Namespace, petsc: list[str]) -> Comparison:
             records += found
             for r in (r for r in found if r["kind"] != "converged"):
                 where = f"{by_path[r['scene']].label}, {r['variant']}, {r['ranks']} rank(s)"
-                _say(f"{where}: {r['kind']} {r['message'] or r['reason']}")
+                say(f"{where}: {r['kind']} {r['message'] or r['reason']}")
     except KeyboardInterrupt:
         if not records:
             raise
@@ -577,22 +554,12 @@ def _variants(
     return fitting
 
 
-def _unique(what: str, labels: Sequence[str]) -> None:
-    twice = next((label for label in labels if labels.count(label) > 1), None)
-    if twice is not None:
-        raise UsageError(f"two {what} are called {twice}: rename one, as tables tell them apart by name")
-
-
 def _make_folder(folder: Path) -> None:
     """Make the folder of --out, once nothing in the call is found wrong any more."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise UsageError(f"--out {folder}: cannot be made: {e.strerror}") from e
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
 
 
 def _print(headings: Sequence[str], rows: Sequence[Sequence[object]]) -> None:

@@ -35,6 +35,7 @@ Times are the slowest rank's. Where a solve crashes, records of those before it 
 
 from __future__ import annotations
 
+import argparse
 import ctypes
 import itertools
 import json
@@ -82,6 +83,8 @@ CLOCKS = {"wall": "wall clock", "cpu": "processor time"}
 """What seconds can be. Processor time, the busiest rank's, is steadier where other programs run, but hides what waits
 for others."""
 
+HOME = Path(__file__).resolve().parent.parent.parent
+"""Where the package lies."""
 GRACE = 5.0
 """Seconds that mpiexec has to end its ranks before it is killed."""
 POLL = 0.02
@@ -127,15 +130,6 @@ class Job:
     memory_limit: int | None = None  # bytes of address space that each rank may have
     keep_going: bool = False  # whether the next scene follows after an error that all ranks raised
 
-    def to_json(self) -> str:
-        """What the measured process reads."""
-        return json.dumps(asdict(self), default=os.fspath)
-
-    @classmethod
-    def from_json(cls, text: str) -> Job:
-        """Read what `to_json` wrote."""
-        return cls(**json.loads(text))
-
 
 @dataclass(frozen=True)
 class Variant:
@@ -160,7 +154,7 @@ class Variant:
         path = options_files.find_options_file(name)
         options_files.parse(path)
         header = options_files.read_header(path)
-        label, chosen = " ".join([path.stem, *own]), {**(more or {}), **petsc_options(own)}
+        label, chosen = " ".join([path.stem, *own]), {**(more or {}), **options_files.Given.of(own).values}
         text = path.read_text(encoding="utf-8")
         return cls(label, str(path), chosen, header.fields, header.not_for, header.purpose, text)
 
@@ -169,36 +163,45 @@ class Variant:
         return (not self.fields or set(self.fields) == set(fields)) and not set(names) & set(self.not_for)
 
 
-def petsc_options(words: Sequence[str]) -> dict[str, str | None]:
-    """PETSc's options by name, without the dash, from words of a command line."""
-    found: dict[str, list[str]] = {}
-    last = ""
-    for word in words:
-        if re.match(r"-[A-Za-z_]", word):
-            last = word[1:]
-            found[last] = []
-        elif last:
-            found[last].append(word)
-        else:
-            raise UsageError(f"{word!r} is not an option; options start with '-'")
-    return {name: " ".join(values) or None for name, values in found.items()}
-
-
 def split_ranks(petsc: Sequence[str]) -> tuple[list[int], dict[str, str | None]]:
-    """Numbers of ranks from `-n`, and PETSc's other options by name.
+    """The number of ranks that `-n` says, if it is there, and PETSc's other options by name.
 
     Raises:
         UsageError: -n has no number.
     """
-    found = petsc_options(petsc)
-    ranks: list[int] = []
-    for name in ("n", "np"):
-        if name in found:
-            values = (found.pop(name) or "").split()
-            if not values or not all(v.isdecimal() and int(v) for v in values):
-                raise UsageError(f"-{name}: expected numbers of ranks")
-            ranks = [int(v) for v in values]
-    return ranks, found
+    found = options_files.Given.of(petsc).values
+    ranks = [found.pop(name) or "" for name in ("n", "np") if name in found]
+    if not all(number.isdecimal() and int(number) for number in ranks):
+        raise UsageError("-n: expected a number of ranks; --ranks takes several")
+    return [int(number) for number in ranks[-1:]], found
+
+
+def positive(kind: type[int] | type[float]) -> Callable[[str], float]:
+    """A type of arguments for argparse: numbers above zero."""
+
+    def number(text: str) -> float:
+        found = kind(text)
+        if not found > 0:
+            raise argparse.ArgumentTypeError(f"expected a positive number, found {text}")
+        return found
+
+    return number
+
+
+def refuse_twice(what: str, names: Sequence[str]) -> None:
+    """Refuse a call in which a name stands for two things.
+
+    Raises:
+        UsageError: there is one.
+    """
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise UsageError(f"{twice}: named twice; {what} need different names, as tables tell them apart by these")
+
+
+def say(line: str) -> None:
+    """Tell who waits what is going on."""
+    print(line, file=sys.stderr, flush=True)
 
 
 def measure_all(
@@ -239,13 +242,8 @@ def measure_all(
             left = [s for s in group if fits(s, v) and (s, v.label, n) not in hung]
             while left:
                 references = {s: job.references[s] for s in left if s in job.references}
-                what: dict[str, Any] = {
-                    "options_file": v.path or None,
-                    "options": v.options,
-                    "ranks": n,
-                    "references": references,
-                }
-                found = measure(replace(job, scenes=left, **what), mpiexec=mpiexec)
+                what = replace(job, scenes=left, ranks=n, references=references)
+                found = measure(replace(what, options_file=v.path or None, options=v.options), mpiexec=mpiexec)
                 hung |= {(r["scene"], v.label, n) for r in found if r["kind"] == "hang"}
                 yield [r | {"variant": v.label, "ranks": n, "round": number} for r in found]
                 done = {r["scene"] for r in found}
@@ -271,7 +269,7 @@ def measure(job: Job, *, mpiexec: Path_ | None = None) -> list[Record]:
     """
     with tempfile.TemporaryDirectory(prefix="petsc_fs-") as folder:
         events, request, output = (Path(folder) / name for name in ("events", "job.json", "output"))
-        request.write_text(job.to_json(), encoding="utf-8")
+        request.write_text(json.dumps(asdict(job), default=os.fspath), encoding="utf-8")
         events.touch()
         program = [sys.executable, "-m", "petsc_fs.tools.probe", str(request), str(events)]
         with output.open("wb") as sink:
@@ -384,23 +382,21 @@ def launcher(ranks: int, mpiexec: Path_ | None = None) -> list[str]:
     Raises:
         UsageError: there is no mpiexec and more than one rank is asked for.
     """
-    program = find_mpiexec() if mpiexec is None else os.fspath(mpiexec)
-    if program is None:
-        if ranks == 1:
-            return []
+    program = mpiexec or find_mpiexec()
+    if program is None and ranks > 1:
         raise UsageError("no mpiexec on PATH: install one, or name it with MPIEXEC")
-    return [program, "-n", str(ranks)]
+    return [] if program is None else [os.fspath(program), "-n", str(ranks)]
 
 
 def find_mpiexec() -> str | None:
     """`scripts/mpiexec` of a source tree, or what MPIEXEC names, or the one beside Python, or the one on PATH."""
-    script = Path(__file__).resolve().parent.parent.parent / "scripts" / "mpiexec"
-    return str(script) if script.is_file() else os.environ.get("MPIEXEC") or _mpiexec_beside_python()
+    script = HOME / "scripts" / "mpiexec"
+    return str(script) if script.is_file() else os.environ.get("MPIEXEC") or _installed_mpiexec()
 
 
-def _mpiexec_beside_python() -> str | None:
-    beside = Path(sys.base_prefix) / "bin" / "mpiexec"
-    return str(beside) if beside.is_file() else shutil.which("mpiexec")
+def _installed_mpiexec() -> str | None:
+    places = [str(Path(sys.base_prefix) / "bin"), os.environ.get("PATH", os.defpath)]
+    return shutil.which("mpiexec", path=os.pathsep.join(places))
 
 
 def environment() -> dict[str, str]:
@@ -410,9 +406,8 @@ def environment() -> dict[str, str]:
     """
     traces = ("PMIX_", "PMI_", "OMPI_COMM_WORLD_", "OMPI_UNIVERSE_", "OMPI_APP_", "OMPI_FILE_LOCATION", "PRTE_LAUNCHED")
     kept = {name: value for name, value in os.environ.items() if not name.startswith(traces)}
-    here = str(Path(__file__).resolve().parent.parent.parent)
-    paths = [here, *kept.get("PYTHONPATH", "").split(os.pathsep)]
-    defaults = {"OMP_NUM_THREADS": "1", "MPIEXEC": _mpiexec_beside_python() or "mpiexec"}
+    paths = [str(HOME), *kept.get("PYTHONPATH", "").split(os.pathsep)]
+    defaults = {"OMP_NUM_THREADS": "1", "MPIEXEC": _installed_mpiexec() or "mpiexec"}
     return defaults | kept | {"PYTHONPATH": os.pathsep.join(p for p in paths if p)}
 
 
