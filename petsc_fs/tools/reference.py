@@ -31,6 +31,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -72,22 +73,15 @@ POWER_STEPS = 6
 
 @dataclass(frozen=True)
 class Reference:
-    """A solution and what is known of its accuracy.
+    """A solution and what is known of its accuracy."""
 
-    Attributes:
-        solution: all rows of each field, rounded to double precision.
-        method: what it was computed by, in words.
-        corrections: size of each correction relative to the solution, in the worst field; the last one bounds what is
-            wrong with the solution before it is rounded.
-        backward_error: of the rounded solution, see `backward_error`.
-        scene_digest: of the scene's file; "" if there is none.
-    """
-
-    solution: dict[str, Floats]
-    method: str
-    corrections: tuple[float, ...]
-    backward_error: dict[str, float]
-    scene_digest: str = ""
+    solution: dict[str, Floats]  # all rows of each field, rounded to double precision
+    method: str  # what it was computed by, in words
+    corrections: tuple[
+        float, ...
+    ]  # size of each, relative to the solution, in the worst field; the last one is a bound
+    backward_error: dict[str, float]  # of the rounded solution, see `backward_error`
+    scene_digest: str = ""  # of the scene's file; "" if there is none
 
     def about(self) -> dict[str, Any]:
         """Everything but the solution, for JSON."""
@@ -116,9 +110,12 @@ def solve(scene: Scene, method: str = "auto", scene_digest: str = "") -> Referen
             if large:
                 raise
             return solve(scene, "iterative", scene_digest)
-    matrix, b = one_block(scene), np.concatenate([scene.rhs[f] for f in scene.fields])
-    with _direct(matrix) if method == "direct" else _iterative(scene) as (correct, words):
+    matrix, b = one_block(scene), together(scene, scene.rhs)
+    with factors(matrix) if method == "direct" else _krylov(scene) as (correct, _):
         x, corrections = refine(matrix, b, correct, [scene.sizes[f] for f in scene.fields])
+    words = "LU of the equilibrated matrix"
+    if method == "iterative":
+        words = f"the field-split Krylov method to {INNER_RTOL:g}"
     if not corrections[-1] <= USELESS:
         raise SolveError(
             f"no reference solution: after {len(corrections)} corrections by {words} the last one is still "
@@ -144,6 +141,11 @@ def one_block(scene: Scene, fields: Sequence[str] = ()) -> CSR:
 def rows_of(block: CSR) -> NDArray[np.int64]:
     """Row number of each entry."""
     return np.repeat(np.arange(block.indptr.size - 1), np.diff(block.indptr))
+
+
+def together(scene: Scene, values: FieldArrays) -> Floats:
+    """All fields as one vector, numbered as `one_block`."""
+    return np.concatenate([values[f] for f in scene.fields])
 
 
 def by_field(scene: Scene, vector: Floats) -> dict[str, Floats]:
@@ -269,19 +271,16 @@ def factors(matrix: CSR) -> Iterator[tuple[Solve, Solve]]:
     pc.setOperators(A)
     x, y = A.createVecs()
 
-    def applied(apply: Callable[[Any, Any], None], left: Floats, right: Floats) -> Solve:
-        def function(v: Floats) -> Floats:
-            y.setArray(right * v)
-            apply(y, x)
-            return np.asarray(left * x.getArray())
-
-        return function
+    def applied(apply: Callable[[Any, Any], None], left: Floats, right: Floats, v: Floats) -> Floats:
+        y.setArray(right * v)
+        apply(y, x)
+        return np.asarray(left * x.getArray())
 
     try:
         with inserted(WORKSPACE if package == "mumps" else {}, PREFIX):
             pc.setFromOptions()
             pc.setUp()
-        yield applied(pc.apply, c, r), applied(pc.applyTranspose, r, c)
+        yield partial(applied, pc.apply, c, r), partial(applied, pc.applyTranspose, r, c)
     except PETSc.Error as e:
         raise SolveError(f"{package} cannot factorise the matrix (error {e.ierr})") from e
     finally:
@@ -290,14 +289,8 @@ def factors(matrix: CSR) -> Iterator[tuple[Solve, Solve]]:
 
 
 @contextmanager
-def _direct(matrix: CSR) -> Iterator[tuple[Solve, str]]:
-    with factors(matrix) as (inverse, _):
-        yield inverse, "LU of the equilibrated matrix"
-
-
-@contextmanager
-def _iterative(scene: Scene) -> Iterator[tuple[Solve, str]]:
-    """The Krylov solver for the scene: its solve, and what it is."""
+def _krylov(scene: Scene) -> Iterator[tuple[Solve, None]]:
+    """The default Krylov solver for the scene, as a function; in the place of `factors`."""
     from mpi4py import MPI
 
     from petsc_fs.solver import Solver
@@ -308,11 +301,10 @@ def _iterative(scene: Scene) -> Iterator[tuple[Solve, str]]:
 
         def correct(r: Floats) -> Floats:
             size = float(np.linalg.norm(r)) or 1.0
-            found = solver.solve(rhs=by_field(scene, r / size)).solution
-            return size * np.concatenate([found[f] for f in scene.fields])
+            return size * together(scene, solver.solve(rhs=by_field(scene, r / size)).solution)
 
         try:
-            yield correct, f"the field-split Krylov method to {INNER_RTOL:g}"
+            yield correct, None
         finally:
             solver.destroy()
 
@@ -322,20 +314,17 @@ def _iterative(scene: Scene) -> Iterator[tuple[Solve, str]]:
 
 def weights(scene: Scene) -> dict[str, Floats]:
     """Weight w of each unknown, (size,) per field, such that the square of a field's norm is Σ w x²."""
-    return {f: _weights(scene, f) for f in scene.fields}
-
-
-def _weights(scene: Scene, name: str) -> Floats:
-    volumes = scene.cell_volumes.get(name)
-    if volumes is None or not volumes.size or not (volumes > 0).all():
-        return np.ones(scene.sizes[name])
-    if name in FLUXES:
-        per_cell = 1.0 / volumes
-    else:
+    found = {}
+    for name, size in scene.sizes.items():
+        volumes = scene.cell_volumes.get(name)
+        if volumes is None or not volumes.size or not (volumes > 0).all():
+            found[name] = np.ones(size)
+            continue
         dimension = scene.cell_dimension if name == "mass" else None
         groups = np.zeros(volumes.size, dtype=np.int64) if dimension is None else np.asarray(dimension)
-        per_cell = volumes / np.bincount(groups, weights=volumes)[groups]
-    return np.repeat(per_cell, scene.block_size(name))
+        per_cell = 1.0 / volumes if name in FLUXES else volumes / np.bincount(groups, weights=volumes)[groups]
+        found[name] = np.repeat(per_cell, scene.block_size(name))
+    return found
 
 
 class Ruler:
@@ -373,13 +362,17 @@ class Ruler:
 
 def _norm(weight: Floats, values: Floats) -> float:
     largest = _greatest(values)  # by which nothing over- or underflows when it is squared
-    if not (largest > 0 and np.isfinite(largest)):
+    if not 0 < largest < np.inf:
         return largest
     return largest * float(np.sqrt(np.sum(weight * (values / largest) ** 2)))
 
 
 def _greatest(values: Floats) -> float:
     return float(np.max(np.abs(values), initial=0.0))
+
+
+def _greatest_of(values: FieldArrays) -> float:
+    return max(map(_greatest, values.values()), default=0.0)
 
 
 def multiply(block: CSR, x: Floats) -> Floats:
@@ -419,20 +412,17 @@ def backward_error(scene: Scene, solution: FieldArrays, of: FieldArrays | None =
             known[r] -= multiply(block, solution[c])
         of = known
     scales = magnitudes(scene, solution)
-    sums = {f: np.zeros(n) for f, n in scene.sizes.items()}
-    for (name, column), block in scene.blocks.items():
-        sums[name] += multiply(block._replace(data=np.abs(block.data)), np.ones(scene.sizes[column]))
-    norm = max(map(_greatest, sums.values()), default=0.0) * max(map(_greatest, solution.values()), default=0.0)
-    norm += max(map(_greatest, scene.rhs.values()), default=0.0)
+    ones = {f: np.ones(n) for f, n in scene.sizes.items()}
+    sums = magnitudes(replace(scene, rhs={f: 0 * v for f, v in ones.items()}), ones)
+    norm = _greatest_of(sums) * _greatest_of(solution) + _greatest_of(scene.rhs)
     componentwise = fieldwise = 0.0
     for f, rest in of.items():
-        exact = np.where(rest == 0, 0.0, np.inf)
-        componentwise = max(
-            componentwise, _greatest(np.divide(np.abs(rest), scales[f], out=exact, where=scales[f] > 0))
-        )
+        share = np.where(rest == 0, 0.0, np.inf)
+        np.divide(np.abs(rest), scales[f], out=share, where=scales[f] > 0)
+        componentwise = max(componentwise, _greatest(share))
         size, scale = float(np.linalg.norm(rest)), float(np.linalg.norm(scales[f]))
         fieldwise = max(fieldwise, size / scale if scale else float(size > 0))
-    normwise = max(map(_greatest, of.values()), default=0.0) / norm if norm else 0.0
+    normwise = _greatest_of(of) / norm if norm else 0.0
     return {"normwise": normwise, "componentwise": componentwise, "fieldwise": fieldwise}
 
 
@@ -456,16 +446,16 @@ def field_conditions(scene: Scene, solution: FieldArrays) -> dict[str, float]:
     Raises:
         SolveError: the matrix cannot be factorised.
     """
-    largest = max((_greatest(b) for b in scene.rhs.values()), default=0.0)
+    largest = _greatest_of(scene.rhs)
     factor = 2.0 ** -np.frexp(largest)[1] if largest else 1.0  # so that no square over- or underflows
     scene = replace(scene, rhs={f: factor * b for f, b in scene.rhs.items()}, reference={})
     solution = {f: factor * x for f, x in solution.items()}
     sizes = {f: np.linalg.norm(v) for f, v in magnitudes(scene, solution).items()}
-    S = np.concatenate([np.full(scene.sizes[f], sizes[f]) for f in scene.fields])
+    S = np.repeat([sizes[f] for f in scene.fields], [scene.sizes[f] for f in scene.fields])
     natural, random, found = weights(scene), np.random.default_rng(0), {}
     with factors(one_block(scene)) as (inverse, transposed):
         for name in scene.fields:
-            W = np.concatenate([np.sqrt(natural[f]) * (f == name) for f in scene.fields])
+            W = together(scene, {f: np.sqrt(w) * float(f == name) for f, w in natural.items()})
             v, norm = random.standard_normal(S.size), 0.0
             for _ in range(POWER_STEPS):
                 forward = W * inverse(S * v / (np.linalg.norm(v) or 1.0))
@@ -473,7 +463,7 @@ def field_conditions(scene: Scene, solution: FieldArrays) -> dict[str, float]:
                     raise SolveError("no condition number: the factors of the matrix are not finite")
                 norm = float(np.linalg.norm(forward))
                 v = S * transposed(W * forward)
-            size = float(np.linalg.norm(W * np.concatenate([solution[f] for f in scene.fields])))
+            size = float(np.linalg.norm(W * together(scene, solution)))
             found[name] = norm / size if size else float("inf")
     return found
 
