@@ -360,7 +360,7 @@ def test_base_file_that_fails_ends_the_sweep(tmp_path: Path, made_up: Any) -> No
 
 def test_memory_and_processor_time_can_be_what_counts(tmp_path: Path, made_up: Any) -> None:
     made_up(by_restart)
-    results = Sweep(settings(tmp_path, objectives=("memory",), clock="cpu", trials=30)).run()
+    results = Sweep(settings(tmp_path, objective=("memory",), clock="cpu", trials=30)).run()
     assert results["trials"][results["final"]["best"]]["values"]["all.ksp_gmres_restart"] == 50
     assert results["front_objectives"] == ["memory", "time"]
     assert results["final"]["finalists"][str(results["final"]["best"])]["flow.h5"]["base"]["seconds"] == 2.0

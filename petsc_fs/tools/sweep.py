@@ -24,7 +24,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,7 +35,7 @@ from petsc_fs.errors import SolveError, UsageError
 from petsc_fs.io import hdf5
 from petsc_fs.io.files import write_text
 from petsc_fs.tools import measure
-from petsc_fs.tools.measure import say
+from petsc_fs.tools.measure import positive, say
 from petsc_fs.tools.pages import markdown
 from petsc_fs.tools.space import Space, Value, find_space, label, read
 
@@ -78,6 +78,16 @@ STARTUP_TRIALS = 20
 """Random trials before TPE has a model to go by."""
 
 
+def _option(default: Any, said: str, **how: Any) -> Any:
+    """A setting that is an option of the command line, too: its default, what it is, and argparse's words for it."""
+    shown = "" if default is None or isinstance(default, tuple) else f" (default {default})"
+    return field(default=default, metadata={"help": said + shown, **how})
+
+
+def _bytes(text: str) -> int:
+    return int(float(text) * 1e9)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     """What a sweep is asked to do."""
@@ -86,20 +96,25 @@ class Settings:
     space: Space
     out: Path  # folder of the sweep
     hold_out: tuple[Path, ...] = ()  # scenes that only the base file and the best one solve, at the end
-    trials: int = 200  # finished ones of earlier runs included
-    sampler: str = "tpe"  # of SAMPLERS
-    objectives: tuple[str, ...] = ("time", "memory")  # of OBJECTIVES; the first one chooses the best file
-    aggregate: str = "mean"  # of the ratios on several scenes, the geometric mean or the worst
-    ranks: int = 1
-    rtol: float | None = None  # None for that of the base file
-    repetitions: int = 1  # solves of each scene in a trial, of which the median counts
-    time_limit: float = 300.0  # seconds for one solve, with start and set-up
-    memory_limit: int | None = None  # bytes of address space of each rank
-    patience: float = 3.0  # a trial is given up at so many times what the base file takes; 0 for never
-    finalists: int = 3  # files measured again at the end, to choose the best
-    confirm: int = 3  # measurements of each of them, and on the scenes held out
-    clock: str = "wall"  # of petsc_fs.tools.measure.CLOCKS
-    seed: int = 0  # of the sampler
+    # fmt: off
+    trials: int = _option(200, "trials, finished ones included", type=positive(int), metavar="N")
+    sampler: str = _option("tpe", "how values are chosen", choices=SAMPLERS)
+    objective: tuple[str, ...] = _option(("time", "memory"), "what to make small; the first one chooses the best file "
+        "(default time memory)", choices=OBJECTIVES, nargs="+")
+    aggregate: str = _option("mean", "of several scenes, as ratio to the base file", choices=AGGREGATES)
+    ranks: int = _option(1, "MPI ranks of each solve", type=positive(int), metavar="N")
+    rtol: float | None = _option(None, "relative tolerance (default that of the base file)", type=float, metavar="R")
+    repetitions: int = _option(1, "solves of each scene in a trial, of which the median counts", type=positive(int),
+        metavar="N")
+    time_limit: float = _option(300.0, "seconds for one solve, start included", type=positive(float), metavar="S")
+    memory_limit: int | None = _option(None, "address space of each rank", type=_bytes, metavar="GB")
+    patience: float = _option(3.0, "give up a trial at X times what the base file takes; 0: never", type=float,
+        metavar="X")
+    finalists: int = _option(3, "files measured again at the end, to choose the best", type=positive(int), metavar="N")
+    confirm: int = _option(3, "measurements of each of them, and on scenes held out", type=positive(int), metavar="N")
+    clock: str = _option("wall", "cpu: processor time, where others compute, too", choices=measure.CLOCKS)
+    seed: int = _option(0, "of the sampler", type=int, metavar="N")
+    # fmt: on
 
     @property
     def tolerance(self) -> float:
@@ -115,7 +130,7 @@ class Settings:
             "scenes": " ".join(f"{path.name} ({digest(path)[:12]})" for path in self.scenes),
             "space": json.dumps([repr(p) for p in self.space.parameters]),
             "base file": self.space.base.read_text(encoding="utf-8"),
-            **{name: str(getattr(self, name)) for name in ("objectives", "aggregate", "ranks", "tolerance", "clock")},
+            **{name: str(getattr(self, name)) for name in ("objective", "aggregate", "ranks", "tolerance", "clock")},
         }
 
 
@@ -217,7 +232,7 @@ class Sweep:
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         settings, storage, identity = self.settings, self._storage(), self.settings.identity()
-        directions = ["minimize"] * len(settings.objectives)
+        directions = ["minimize"] * len(settings.objective)
         study = optuna.create_study(storage=storage, study_name="sweep", directions=directions, load_if_exists=True)
         there = study.user_attrs.get("identity", identity)
         other = next((key for key in identity if there.get(key) != identity[key]), None)
@@ -341,7 +356,7 @@ class Sweep:
     def _tell(self, attempt: Attempt) -> None:
         """End a trial; what was not solved is pruned for optuna, whose samplers then avoid it."""
         if attempt["outcome"] == "solved":
-            self.study.tell(attempt["number"], [attempt["totals"][o] for o in self.settings.objectives])
+            self.study.tell(attempt["number"], [attempt["totals"][o] for o in self.settings.objective])
         else:
             self.study.tell(attempt["number"], state=_state("PRUNED"))
 
@@ -378,7 +393,7 @@ class Sweep:
 
     def front_objectives(self) -> tuple[str, ...]:
         """Objectives of the front: those of the search, with memory where time is the only one."""
-        named = self.settings.objectives
+        named = self.settings.objective
         return named if len(named) > 1 else (*named, "memory" if named[0] == "time" else "time")
 
     def front(self) -> list[int]:
@@ -389,7 +404,7 @@ class Sweep:
 
     def _choose(self) -> None:
         """Measure the finalists again, choose the best, and measure it and the base file on what was held out."""
-        settings, first = self.settings, self.settings.objectives[0]
+        settings, first = self.settings, self.settings.objective[0]
         candidates = sorted(self.solved(), key=lambda a: a["totals"][first])[: settings.finalists]
         numbers = [a["number"] for a in candidates]
         wanted = [numbers, [p.name for p in settings.hold_out], settings.confirm]
@@ -461,13 +476,13 @@ class Sweep:
         settings, final = self.settings, self.study.user_attrs.get("final")
         outcomes = Counter(a["outcome"] for a in self.attempts.values())
         outcomes.update({"interrupted": self.interrupted} if self.interrupted else {})
-        asked = asdict(settings) | {
+        asked = asdict(settings)
+        asked["objectives"] = asked.pop("objective")
+        return asked | {
             "space": settings.space.path.name,
             "scenes": [p.name for p in settings.scenes],
             "hold_out": [p.name for p in settings.hold_out],
             "out": settings.out.name,
-        }
-        return asked | {
             "command": " ".join(["petsc-fs", *sys.argv[1:]]),
             "description": settings.space.description,
             "base": settings.space.base.name,
@@ -632,30 +647,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `petsc-fs sweep`."""
     parser.epilog = EPILOG
     add = parser.add_argument
-    number, seconds = measure.positive(int), measure.positive(float)
-    # fmt: off
     add("scenes", metavar="SCENE", nargs="+", help="scenes that every trial solves")
     add("--space", required=True, metavar="FILE.yaml", help="what may change: a space, or the name of a shipped one")
-    add("--trials", type=number, default=200, metavar="N", help="trials, finished ones included (default 200)")
-    add("--sampler", choices=SAMPLERS, default="tpe", help="how values are chosen (default tpe)")
-    add("--objective", nargs="+", choices=OBJECTIVES, default=["time", "memory"],
-        help="what to make small; the first one chooses the best file (default time memory)")
-    add("--aggregate", choices=AGGREGATES, default="mean", help="of several scenes, as ratio to the base file")
     add("--hold-out", nargs="+", default=[], metavar="SCENE", help="scenes measured at the end only, reported apart")
-    add("--ranks", type=number, default=1, metavar="N", help="MPI ranks of each solve (default 1)")
-    add("--rtol", type=float, metavar="R", help="relative tolerance (default that of the base file)")
-    add("--repetitions", type=number, default=1, metavar="N", help="solves of each scene in a trial (default 1)")
-    add("--time-limit", type=seconds, default=300.0, metavar="S", help="seconds for one solve, start included")
-    add("--memory-limit", type=float, metavar="GB", help="address space of each rank")
-    add("--patience", type=float, default=3.0, metavar="X",
-        help="give up a trial at X times what the base file takes (default 3; 0: never)")
-    add("--finalists", type=number, default=3, metavar="N", help="files measured again at the end (default 3)")
-    add("--confirm", type=number, default=3, metavar="N", help="measurements of each of them (default 3)")
-    add("--clock", choices=measure.CLOCKS, default="wall", help="cpu: processor time, where others compute, too")
-    add("--seed", type=int, default=0, metavar="N", help="of the sampler")
+    for f in fields(Settings):
+        if f.metadata:
+            add(f"--{f.name.replace('_', '-')}", default=f.default, **f.metadata)
     add("--out", type=Path, metavar="DIR", help="folder of the sweep (default sweep-SPACE)")
     add("--page", type=Path, metavar="FILE.md", help="write the report here, too, with its picture beside it")
-    # fmt: on
 
 
 def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
@@ -703,13 +702,6 @@ def _settings(args: argparse.Namespace) -> Settings:
         if not header.fits(hdf5.read_sizes(path)[1]):
             raise UsageError(f"{path.name}: {space.base.name} is for scenes with the fields {', '.join(header.fields)}")
     measure.refuse_twice("scenes, held out or not,", [path.name for path in (*scenes, *hold_out)])
-    same = "trials sampler aggregate ranks rtol repetitions time_limit patience finalists confirm clock seed".split()
-    return Settings(
-        scenes=scenes,
-        hold_out=hold_out,
-        space=space,
-        out=args.out or Path(f"sweep-{space.path.stem}"),
-        objectives=tuple(dict.fromkeys(args.objective)),
-        memory_limit=int(args.memory_limit * 1e9) if args.memory_limit else None,
-        **{name: getattr(args, name) for name in same},
-    )
+    asked = {f.name: getattr(args, f.name) for f in fields(Settings) if f.metadata}
+    asked |= {"objective": tuple(dict.fromkeys(args.objective)), "out": args.out or Path(f"sweep-{space.path.stem}")}
+    return Settings(scenes=scenes, hold_out=hold_out, space=space, **asked)
