@@ -1,8 +1,6 @@
 """Compare options files: error against seconds, or seconds against those of a base file, on any scenes and ranks.
 
-Each combination of scene, options file and number of ranks is measured in processes of its own, all of them once
-before any is measured again and each time in another order, so that noise falls on all alike. The reference solution
-of each scene is computed first, in a process of its own, see `petsc_fs.tools.reference`.
+See `METHOD` for how, and `petsc_fs.tools.reference` for the reference solution of each scene, which comes first.
 """
 
 from __future__ import annotations
@@ -30,20 +28,8 @@ import numpy as np
 from petsc_fs import options
 from petsc_fs.errors import UsageError
 from petsc_fs.io.files import write_text
-from petsc_fs.tools.measure import (
-    CLOCKS,
-    Job,
-    Record,
-    Variant,
-    describe_machine,
-    grown,
-    measure_all,
-    positive,
-    refuse_twice,
-    say,
-    seconds_of,
-    split_ranks,
-)
+from petsc_fs.tools import measure
+from petsc_fs.tools.measure import CLOCKS, Job, Record, Variant, grown, positive, say, seconds_of
 from petsc_fs.tools.pages import hypertext
 
 if TYPE_CHECKING:
@@ -81,8 +67,8 @@ class Case:
 
         if sequence.is_sequence(path):
             contents = sequence.read_contents(path)
-            first = contents.steps[0]
-            return cls(path.stem, str(path), first.dimension, first.sizes, contents.model, len(contents.steps))
+            first, model, steps = contents.steps[0], contents.model, len(contents.steps)
+            return cls(path.stem, str(path), first.dimension, first.sizes, model, steps)
         dimension, sizes = hdf5.read_sizes(path)
         with hdf5.open_file(path) as file:
             model = str(file.attrs["model"])
@@ -116,11 +102,10 @@ class Comparison:
     def from_json(cls, text: str) -> Comparison:
         """Read what `to_json` wrote."""
         data = json.loads(text)
-        cases = tuple(Case(**case) for case in data.pop("cases"))
-        lists = ("fields", "not_for")
-        variants = tuple(Variant(**(v | {k: tuple(v[k]) for k in lists})) for v in data.pop("variants"))
-        ranks, rtols = tuple(data.pop("ranks")), tuple(data.pop("rtols"))
-        return cls(cases=cases, variants=variants, ranks=ranks, rtols=rtols, **data)
+        cases = tuple(Case(**case) for case in data["cases"])
+        variants = tuple(Variant(**v) for v in data["variants"])
+        exact = {name: tuple(data[name]) for name in ("ranks", "rtols")}
+        return cls(**(data | exact | {"cases": cases, "variants": variants}))
 
 
 @dataclass(frozen=True)
@@ -176,32 +161,28 @@ def points(found: Comparison) -> list[Point]:
         theirs = {k: seconds_of(base[k], found.clock) for k in mine if k in base}
         ratios = {what: [mine[k][what] / s[what] for k, s in theirs.items()] for what in ("setup", *SECONDS)}
         errors = [r["forward_error"] for r in good.values() if r["forward_error"] is not None]
-        rows.append(
-            Point(
-                scene=labels[scene],
-                file=file,
-                ranks=ranks,
-                rtol=rtol,
-                ended=len(good) == len(runs),
-                converged=all(r["kind"] == "converged" for r in runs.values()),
-                iterations=median(r["iterations"] for r in good.values()),
-                error=median(errors) if errors else float("nan"),
-                residual=median(r["true_residual"] for r in good.values()),
-                seconds={what: Spread.of([s[what] for s in mine.values()]) for what in ("setup", *SECONDS)},
-                ratios={what: Spread.of(values) for what, values in ratios.items() if values},
-                memory=median(map(grown, good.values())),
-            )
+        point = Point(
+            *(labels[scene], file, ranks, rtol),
+            ended=len(good) == len(runs),
+            converged=all(r["kind"] == "converged" for r in runs.values()),
+            iterations=median(r["iterations"] for r in good.values()),
+            error=median(errors) if errors else float("nan"),
+            residual=median(r["true_residual"] for r in good.values()),
+            seconds={what: Spread.of([s[what] for s in mine.values()]) for what in ("setup", *SECONDS)},
+            ratios={what: Spread.of(values) for what, values in ratios.items() if values},
+            memory=median(map(grown, good.values())),
         )
+        rows.append(point)
     return rows
 
 
 @dataclass(frozen=True)
 class Fastest:
-    """The fastest file for an accuracy."""
+    """The fastest file for an accuracy, and other files whose quartiles overlap with its own, from the fastest."""
 
     file: str
     seconds: float  # median of its fastest point whose error is not above the accuracy
-    ties: tuple[str, ...]  # other files whose quartiles overlap with its own, from the fastest
+    ties: tuple[str, ...]
 
     def __str__(self) -> str:
         ties = f" (≈ {', '.join(self.ties)})" if self.ties else ""
@@ -211,21 +192,17 @@ class Fastest:
 def fastest(found: Iterable[Point], accuracy: float, what: str) -> Fastest | None:
     """The fastest file whose forward error is at most `accuracy`, or None if no file gets there.
 
-    Args:
-        found: points of one scene and number of ranks; those that did not end in every round do not count.
-        accuracy: forward error.
-        what: of `SECONDS`, what counts.
+    Of points of one scene and number of ranks; those that did not end in every round do not count, and of `SECONDS`
+    does `what`.
     """
-    best: dict[str, Spread] = {}
-    for point in found:
-        if point.ended and point.error <= accuracy:
-            spread = point.seconds[what]
-            if point.file not in best or spread.median < best[point.file].median:
-                best[point.file] = spread
+    good = [(p.seconds[what], p.file) for p in found if p.ended and p.error <= accuracy]
+    good.sort(key=lambda pair: pair[0].median)
+    best = {file: spread for spread, file in reversed(good)}  # of each file the first one
     if not best:
         return None
-    (file, first), *others = sorted(best.items(), key=lambda item: item[1].median)
-    return Fastest(file, first.median, tuple(label for label, spread in others if spread.low <= first.high))
+    first, file = good[0]
+    ties = dict.fromkeys(label for _, label in good if label != file and best[label].low <= first.high)
+    return Fastest(file, first.median, tuple(ties))
 
 
 def summary(found: Comparison, everything: Sequence[Point]) -> list[list[object]]:
@@ -279,11 +256,7 @@ def failures(found: Comparison) -> list[list[object]]:
 
 
 def rtols_of(text: str) -> tuple[float, ...]:
-    """Tolerances from "1e-2..1e-12" (every decade), "1e-2..1e-12:2" (every second), or "1e-3,1e-6".
-
-    Raises:
-        UsageError: it cannot be read, or a tolerance is not between 0 and 1.
-    """
+    """Tolerances from "1e-2..1e-12" (every decade), "1e-2..1e-12:2" (every second), or "1e-3,1e-6"; or a UsageError."""
     match = re.fullmatch(r"([^.,:]+(?:\.\d+)?(?:e-?\d+)?)\.\.([^:,]+?)(?::(\d+))?", text)
     try:
         if match is not None:
@@ -304,12 +277,12 @@ def to_csv(found: Comparison) -> str:
     """One line for each record; phases, fields and ranks in columns of their own."""
     rows = []
     for record in found.records:
-        row = {k: v for k, v in record.items() if not isinstance(v, dict | list)}
-        for name, values in record.items():
-            if isinstance(values, dict):
-                row |= {f"{name.removesuffix('_by_field')}_{key}": value for key, value in values.items()}
-            elif isinstance(values, list):
-                row[f"{name}_max"] = max(values)
+        row: Record = {}
+        for name, value in record.items():
+            if isinstance(value, dict):
+                row |= {f"{name.removesuffix('_by_field')}_{key}": v for key, v in value.items()}
+            else:
+                row |= {f"{name}_max": max(value)} if isinstance(value, list) else {name: value}
         rows.append(row | {"scene": Path(record["scene"]).stem})
     first = ["scene", "ranks", "variant", "round", "rtol", "kind", "iterations"]
     text = io.StringIO()
@@ -462,7 +435,7 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
             found = Comparison.from_json(args.again.read_text(encoding="utf-8"))
         except (OSError, ValueError, TypeError, KeyError) as e:
             raise UsageError(f"--again {args.again}: not a comparison: {e}") from e
-        _make_folder(args.out)
+        measure.make_folder(args.out)
     else:
         found = _measure(args, petsc)
     if args.clock is not None:
@@ -486,19 +459,22 @@ def _measure(args: argparse.Namespace, petsc: list[str]) -> Comparison:
     from petsc_fs.io.bundled import find_scene
     from petsc_fs.tools import reference
 
-    more_ranks, more = split_ranks(petsc)
+    more_ranks, more = measure.split_ranks(petsc)
     ranks = tuple(dict.fromkeys(args.ranks or more_ranks or [1]))
     rtols = () if args.base and not args.rtol else rtols_of(args.rtol or RTOLS)
     if not args.scenes:
         raise UsageError("name at least one scene; they come before --options")
     cases = [Case.of(path) for path in dict.fromkeys(find_scene(name) for name in args.scenes)]
     variants = _variants(args.options, args.base, cases, more)
-    refuse_twice("scenes", [case.label for case in cases])
+    measure.refuse_twice("scenes", [case.label for case in cases])
     if args.out is not None:
-        _make_folder(args.out)
-    started, complete, records = time.time(), True, list[Record]()
-    references: dict[str, str] = {}
+        measure.make_folder(args.out)  # once nothing in the call is found wrong any more
+    started, complete, records, references = time.time(), True, list[Record](), dict[str, str]()
     by_path = {case.path: case for case in cases}
+
+    def fits(system: str, variant: Variant) -> bool:
+        return variant.fits(tuple(by_path[system].sizes), by_path[system].names)
+
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # batch systems send it when time is up
     try:
         for k, case in enumerate(cases if rtols and args.out is not None else ()):
@@ -506,15 +482,9 @@ def _measure(args: argparse.Namespace, petsc: list[str]) -> Comparison:
                 say(f"reference solution of {case.label}")
                 references[case.path] = os.fspath(args.out / f"reference_{case.label}.npz")
                 cases[k] = replace(case, reference=reference.made(case.path, Path(references[case.path])).about())
-        for found in measure_all(
-            list(by_path),
-            variants,
-            Job(rtols=rtols, warm_up=True, errors=True, references=references, time_limit=args.time_limit),
-            ranks=ranks,
-            repeat=args.repeat,
-            fits=lambda system, variant: variant.fits(tuple(by_path[system].sizes), by_path[system].names),
-            mpiexec=args.mpiexec,
-        ):
+        job = Job(rtols=rtols, warm_up=True, errors=True, references=references, time_limit=args.time_limit)
+        how: dict[str, Any] = {"ranks": ranks, "repeat": args.repeat, "fits": fits, "mpiexec": args.mpiexec}
+        for found in measure.measure_all(list(by_path), variants, job, **how):
             records += found
             for r in (r for r in found if r["kind"] != "converged"):
                 where = f"{by_path[r['scene']].label}, {r['variant']}, {r['ranks']} rank(s)"
@@ -525,41 +495,25 @@ def _measure(args: argparse.Namespace, petsc: list[str]) -> Comparison:
         complete = False
     finally:
         signal.signal(signal.SIGTERM, before)
-    about = {
-        "command": " ".join(["petsc-fs", *sys.argv[1:]]),
-        "date": time.strftime("%Y-%m-%d %H:%M", time.localtime(started)),
-        "minutes": (time.time() - started) / 60,
-        "complete": complete,
-        "load average at the end": os.getloadavg()[2],
-        **describe_machine(),
-    }
-    how = {"clock": args.clock or "wall", "base": variants[0].label if args.base else ""}
-    return Comparison(tuple(cases), tuple(variants), ranks, rtols, args.repeat, records, about, **how)
+    date = time.strftime("%Y-%m-%d %H:%M", time.localtime(started))
+    about = {"command": " ".join(["petsc-fs", *sys.argv[1:]]), "date": date, "minutes": (time.time() - started) / 60}
+    about |= {"complete": complete, "load average at the end": os.getloadavg()[2], **measure.describe_machine()}
+    clock, base = args.clock or "wall", variants[0].label if args.base else ""
+    return Comparison(tuple(cases), tuple(variants), ranks, rtols, args.repeat, records, about, clock, base)
 
 
 def _variants(
     names: Sequence[str] | None, base: str | None, cases: Sequence[Case], more: Mapping[str, str | None]
 ) -> list[Variant]:
-    """Options files by path or name of a shipped one, the base first.
-
-    Raises:
-        UsageError: a file is missing or wrong, or one is for none of the scenes.
-    """
+    """Options files by path or name of a shipped one, the base first; those named must be for one of the scenes."""
     words = names or [str(file.path) for file in options.shipped()]
-    found = list({v.label: v for v in (Variant.of(w, more) for w in ([base, *words] if base else words))}.values())
-    fitting = [v for v in found if any(v.fits(tuple(c.sizes), c.names) for c in cases)]
-    if names and len(fitting) < len(found):
-        wrong = next(v for v in found if v not in fitting)
-        raise UsageError(f"{wrong.path} is for none of the scenes, by its header")
-    return fitting
-
-
-def _make_folder(folder: Path) -> None:
-    """Make the folder of --out, once nothing in the call is found wrong any more."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as e:
-        raise UsageError(f"--out {folder}: cannot be made: {e.strerror}") from e
+    found = {v.label: v for v in (Variant.of(w, more) for w in ([base, *words] if base else words))}
+    for label, v in list(found.items()):
+        if not any(v.fits(tuple(c.sizes), c.names) for c in cases):
+            if names:
+                raise UsageError(f"{v.path} is for none of the scenes, by its header")
+            del found[label]
+    return list(found.values())
 
 
 def _print(headings: Sequence[str], rows: Sequence[Sequence[object]]) -> None:

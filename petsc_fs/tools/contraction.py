@@ -84,8 +84,7 @@ VIOLATIONS = {
 class ContactRows:
     """The numbers in the linearised contact conditions, per fracture cell, in the units of the scene.
 
-    NaN stands where a number does not belong to the state of a cell. A cell that neither sticks nor slides is free
-    tangentially.
+    NaN stands where one does not belong to the state of a cell; what neither sticks nor slides is free tangentially.
     """
 
     closed: Mask
@@ -179,12 +178,7 @@ def evaluate(scene: Scene) -> Contraction:
     """The terms of the theorem's condition, and how far the scene is from its assumptions.
 
     Local, for whole scenes. What the scene cannot tell is missing from the result, and named in its notes.
-
-    Raises:
-        SceneError: the scene is the part of one rank.
     """
-    if scene.rows is not None:
-        raise SceneError("contraction: needs a whole scene, this is the part of one rank")
     notes = _geometry_notes(scene)
     length, stress = _units(scene)
     contact = bool(scene.sizes.get("contact"))
@@ -192,14 +186,14 @@ def evaluate(scene: Scene) -> Contraction:
     terms: dict[str, Floats] = {}
     facts: dict[str, Any] = {}
 
-    def known(what: str, compute: Callable[[], Value]) -> Value | None:
+    def known(what: str, compute: Callable[..., Value], *given: Any) -> Value | None:
         try:
-            return compute()
+            return compute(scene, *given)
         except SceneError as e:
             notes.append(f"{what} not evaluated: {e}")
             return None
 
-    rows = known("contact terms", lambda: contact_rows(scene)) if contact else None
+    rows = known("contact terms", contact_rows) if contact else None
     if rows is not None:
         notes += _contact_notes(rows)
         terms, theorem = contact_terms(rows)
@@ -210,23 +204,19 @@ def evaluate(scene: Scene) -> Contraction:
     if scene.material is None:
         notes.append("coupling term, 4 G D and rate not evaluated: the scene has no material data")
     else:
-        rate = known("rate", lambda: contraction_rate(scene))
-        coupling = known("coupling term", lambda: coupling_term(scene)) if contact else None
+        rate = known("rate", contraction_rate)
+        coupling = known("coupling term", coupling_term) if contact else None
         if coupling is not None:
             terms, theorem = {"coupling": coupling, **terms}, {"coupling": float(np.max(coupling)), **theorem}
         if rows is not None:
-            stiffness = known("4 G D", lambda: korn_trace(scene, rows))
+            stiffness = known("4 G D", korn_trace, rows)
     scale = stress / length
-    centers = scene.cell_centers.get("contact")
-    return Contraction(
-        terms={name: values * scale for name, values in terms.items()},
-        theorem={name: value * scale for name, value in theorem.items()},
-        stiffness=None if stiffness is None else (stiffness[0] * scale, stiffness[1] * scale),
-        rate=rate,
-        centers=None if centers is None else centers * length,
-        notes=tuple(notes),
-        **facts,
-    )
+    if "contact" in scene.cell_centers:
+        facts["centers"] = scene.cell_centers["contact"] * length
+    if stiffness is not None:
+        facts["stiffness"] = (stiffness[0] * scale, stiffness[1] * scale)
+    facts |= {"terms": {name: values * scale for name, values in terms.items()}, "rate": rate, "notes": tuple(notes)}
+    return Contraction(theorem={name: value * scale for name, value in theorem.items()}, **facts)
 
 
 def contact_rows(scene: Scene) -> ContactRows:
@@ -236,7 +226,7 @@ def contact_rows(scene: Scene) -> ContactRows:
         SceneError: there is no contact, cell volumes are missing, or the rows are not of this kind: the
             two walls of a fracture cell must each be one interface cell, as on matching grids.
     """
-    if "contact" not in scene.sizes or "intf_force" not in scene.sizes:
+    if not {"contact", "intf_force"} <= set(scene.sizes):
         raise SceneError("the scene has no contact")
     if "contact" not in scene.cell_volumes:
         raise SceneError("the scene has no areas of the fracture cells (cell_volumes of contact)")
@@ -344,10 +334,7 @@ def contraction_rate(scene: Scene) -> float:
     """Factor q = 1 / (lambda beta) = 1 / (1 + lambda / alpha^2 (1/M + c_f phi)); the worst cell of the rock.
 
     It is 0 where alpha is: flow then does not feel the rock. It is that of the scheme with stabilisation
-    alpha^2 / lambda in the rock and gamma_c in fractures.
-
-    Raises:
-        SceneError: material data are missing.
+    alpha^2 / lambda in the rock and gamma_c in fractures. A SceneError where material data are missing.
     """
     data = _rock_data(scene)
     rock = slice(None) if scene.cell_dimension is None else scene.cell_dimension == scene.dimension
@@ -369,10 +356,8 @@ def korn_trace(scene: Scene, rows: ContactRows) -> tuple[float, float]:
         SceneError: there is no momentum balance or material, or the walls can move without force.
     """
     data = _rock_data(scene)
-    if "momentum" not in scene.sizes:
-        raise SceneError("the scene has no momentum balance")
-    if scene.cell_dimension is None:
-        raise SceneError("the scene has no cell_dimension")
+    if "momentum" not in scene.sizes or scene.cell_dimension is None:
+        raise SceneError(f"the scene has no {'cell_dimension' if 'momentum' in scene.sizes else 'momentum balance'}")
     rock = scene.cell_dimension == scene.dimension
     softness = _largest_compliance(scene, rows)
     ratio = scene.dimension * data["lame_lambda"][rock] / (2 * data["shear_modulus"][rock])
@@ -493,11 +478,9 @@ def _geometry_notes(scene: Scene) -> list[str]:
 
 def _contact_notes(rows: ContactRows) -> list[str]:
     notes = []
-    stiff = int(np.count_nonzero(rows.beta_b == 0))
-    if stiff:
+    if stiff := np.count_nonzero(rows.beta_b == 0):
         notes.append(f"closed cells without elastic closure (K_n = 0), which the analysis does not cover: {stiff}")
-    slipping = int(np.count_nonzero(rows.slip > SLIP * rows.bound / rows.constant))
-    if slipping:
+    if slipping := np.count_nonzero(rows.slip > SLIP * rows.bound / rows.constant):
         notes.append(f"sticking cells that have slipped, against assumption:sticking_ut_zero: {slipping}")
     if not rows.closed.any() and (rows.sticking | rows.sliding).any():
         notes.append("no cell is closed, so that the constant c, and with it |y| and epsilon, remain unknown")

@@ -145,11 +145,7 @@ class Variant:
 
     @classmethod
     def of(cls, words: str, more: Mapping[str, str | None] | None = None) -> Variant:
-        """Read "FILE -option value ...", with further options that all variants have.
-
-        Raises:
-            UsageError: the file is missing, or PETSc would not understand it.
-        """
+        """Read "FILE -option value ...", with further options that all variants have; or raise a UsageError."""
         name, *own = shlex.split(words)
         path = options_files.find_options_file(name)
         options_files.parse(path)
@@ -164,11 +160,7 @@ class Variant:
 
 
 def split_ranks(petsc: Sequence[str]) -> tuple[list[int], dict[str, str | None]]:
-    """The number of ranks that `-n` says, if it is there, and PETSc's other options by name.
-
-    Raises:
-        UsageError: -n has no number.
-    """
+    """The number of ranks that `-n` says, if it is there, and PETSc's other options by name; or a UsageError."""
     found = options_files.Given.of(petsc).values
     ranks = [found.pop(name) or "" for name in ("n", "np") if name in found]
     if not all(number.isdecimal() and int(number) for number in ranks):
@@ -189,14 +181,18 @@ def positive(kind: type[int] | type[float]) -> Callable[[str], float]:
 
 
 def refuse_twice(what: str, names: Sequence[str]) -> None:
-    """Refuse a call in which a name stands for two things.
-
-    Raises:
-        UsageError: there is one.
-    """
+    """Refuse a call in which a name stands for two things by a UsageError."""
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise UsageError(f"{twice}: named twice; {what} need different names, as tables tell them apart by these")
+
+
+def make_folder(folder: Path) -> None:
+    """Make the folder of --out, or raise a UsageError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise UsageError(f"--out {folder}: cannot be made: {e.strerror}") from e
 
 
 def say(line: str) -> None:
@@ -227,7 +223,7 @@ def measure_all(
         repeat: rounds.
         fits: whether a variant is to be measured on a system.
         batch: whether a process takes all systems, one after the other, and not one alone.
-        mpiexec: program that starts ranks.
+        mpiexec: see `measure`.
 
     Yields:
         The records of a process, with `variant` (its label), `ranks` and `round` beside what `measure` gives. A
@@ -251,21 +247,14 @@ def measure_all(
 
 
 def measure(job: Job, *, mpiexec: Path_ | None = None) -> list[Record]:
-    """Measure in a process of its own and say how it ended.
+    """Measure in a process of its own and say how it ended: records in the order scene, repetition, tolerance.
 
     Blocks until the process has ended or was ended. Whatever happens in it is in the records; where it did not come
     to its end, the last record says how, for the solve that was under way, and later solves have none. Ctrl-C ends
     the process before it is raised here; where this process is killed, it ends, too (on Linux).
 
-    Args:
-        job: what to measure.
-        mpiexec: program that starts ranks; default `find_mpiexec`.
-
-    Returns:
-        Records in the order scene, repetition, tolerance.
-
     Raises:
-        UsageError: there is no mpiexec.
+        UsageError: there is no mpiexec, neither the one given nor that of `find_mpiexec`.
     """
     with tempfile.TemporaryDirectory(prefix="petsc_fs-") as folder:
         events, request, output = (Path(folder) / name for name in ("events", "job.json", "output"))
@@ -327,11 +316,8 @@ def end(process: subprocess.Popen[bytes]) -> None:
 def _records(job: Job, events: str, code: int | None, said: str) -> list[Record]:
     """Records of a process from its events, and one more where it did not come to its end.
 
-    Args:
-        job: what was asked for.
-        events: a JSON object a line, see `petsc_fs.tools.probe`; the last line may be cut short.
-        code: exit code; None if the process was ended here because time was up.
-        said: all of its output.
+    Events are a JSON object a line, see `petsc_fs.tools.probe`, of which the last may be cut short; the exit code is
+    None if the process was ended here because time was up; and `said` is all of its output.
     """
     found: list[Record] = []
     at: Record = {"phase": "start"}
@@ -377,11 +363,7 @@ def _signal_number(code: int, said: str) -> int:
 
 
 def launcher(ranks: int, mpiexec: Path_ | None = None) -> list[str]:
-    """Command that starts a program on some ranks.
-
-    Raises:
-        UsageError: there is no mpiexec and more than one rank is asked for.
-    """
+    """Command that starts a program on some ranks; a UsageError where several are asked for and there is no mpiexec."""
     program = mpiexec or find_mpiexec()
     if program is None and ranks > 1:
         raise UsageError("no mpiexec on PATH: install one, or name it with MPIEXEC")

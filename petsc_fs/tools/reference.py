@@ -29,7 +29,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -48,7 +48,6 @@ Floats = NDArray[np.float64]
 FieldArrays = Mapping[str, Floats]
 Solve = Callable[[Floats], Floats]
 
-METHODS = ("direct", "iterative", "auto")
 LARGE = {2: 400_000, 3: 40_000}
 """Number of unknowns, by dimension, from which the iterative method is the default."""
 FLUXES = ("intf_flow",)
@@ -89,27 +88,19 @@ class Reference:
 
 
 def solve(scene: Scene, method: str = "auto", scene_digest: str = "") -> Reference:
-    """Compute a reference solution on this rank alone.
+    """Compute a reference solution of a whole scene on this rank alone. Local.
 
-    Local. The solver's options have the prefix `reference_`.
-
-    Args:
-        scene: with all rows.
-        method: one of `METHODS`; "auto" is "direct" up to the size `LARGE`, and "iterative" beyond, or where the
-            factorisation fails.
-        scene_digest: to be recorded.
+    The method is "direct", "iterative" or "auto": direct up to the size `LARGE`, and iterative beyond, or where the
+    factorisation fails. The solver's options have the prefix `reference_`; the digest is recorded.
 
     Raises:
         SolveError: corrections do not become small.
     """
     if method == "auto":
-        large = sum(scene.sizes.values()) > LARGE[scene.dimension]
-        try:
-            return solve(scene, "iterative" if large else "direct", scene_digest)
-        except SolveError:
-            if large:
-                raise
-            return solve(scene, "iterative", scene_digest)
+        if sum(scene.sizes.values()) <= LARGE[scene.dimension]:
+            with suppress(SolveError):
+                return solve(scene, "direct", scene_digest)
+        return solve(scene, "iterative", scene_digest)
     matrix, b = one_block(scene), together(scene, scene.rhs)
     with factors(matrix) if method == "direct" else _krylov(scene) as (correct, _):
         x, corrections = refine(matrix, b, correct, [scene.sizes[f] for f in scene.fields])
@@ -117,10 +108,8 @@ def solve(scene: Scene, method: str = "auto", scene_digest: str = "") -> Referen
     if method == "iterative":
         words = f"the field-split Krylov method to {INNER_RTOL:g}"
     if not corrections[-1] <= USELESS:
-        raise SolveError(
-            f"no reference solution: after {len(corrections)} corrections by {words} the last one is still "
-            f"{corrections[-1]:.1e} of the solution"
-        )
+        size = f"correction {len(corrections)} by {words} is still {corrections[-1]:.1e} of the solution"
+        raise SolveError(f"no reference solution: {size}")
     solution = by_field(scene, x)
     exact = by_field(scene, residual(matrix, b, x, np.zeros_like(x)))
     return Reference(solution, words, tuple(corrections), backward_error(scene, solution, exact), scene_digest)
@@ -176,11 +165,7 @@ def _halves(a: Floats) -> tuple[Floats, Floats]:
 
 
 def residual(matrix: CSR, b: Floats, x: Floats, y: Floats) -> Floats:
-    """The residual b - A (x + y), each entry rounded once: products are exact, and sums are those of `math.fsum`.
-
-    Raises:
-        SolveError: a sum is not finite.
-    """
+    """The residual b - A (x + y), each entry rounded once: products are exact, and sums are those of `math.fsum`."""
     p, e = two_product(-matrix.data, x[matrix.indices])
     e -= matrix.data * y[matrix.indices]
     ends = matrix.indptr.tolist()
@@ -195,17 +180,11 @@ def residual(matrix: CSR, b: Floats, x: Floats, y: Floats) -> Floats:
 def refine(matrix: CSR, b: Floats, correct: Solve, sizes: list[int]) -> tuple[Floats, list[float]]:
     """Correct a solution, from zero, until corrections are small or no longer become smaller.
 
-    Args:
-        matrix: of the system.
-        b: its right-hand side.
-        correct: approximates J⁻¹ r.
-        sizes: of the fields, in each of which a correction has to be small.
-
-    Returns:
-        The solution, rounded; relative size of each correction, in the worst field.
+    `correct` approximates A⁻¹ r; corrections have to be small in each field, of these sizes. Returns the solution,
+    rounded, and the relative size of each correction, in the worst field.
 
     Raises:
-        SolveError: a correction is not finite.
+        SolveError: a correction or residual is not finite.
     """
     high, low = np.zeros(b.size), np.zeros(b.size)
     bounds = np.cumsum(sizes)[:-1]
@@ -251,11 +230,7 @@ def equilibrate(matrix: CSR) -> tuple[Floats, Floats]:
 
 @contextmanager
 def factors(matrix: CSR) -> Iterator[tuple[Solve, Solve]]:
-    """LU of the equilibrated matrix: A⁻¹ and A⁻ᵀ, as functions.
-
-    Raises:
-        SolveError: the matrix cannot be factorised.
-    """
+    """LU of the equilibrated matrix: A⁻¹ and A⁻ᵀ, as functions; a SolveError where it cannot be factorised."""
     from petsc4py import PETSc
 
     n = matrix.indptr.size - 1
@@ -328,18 +303,9 @@ def weights(scene: Scene) -> dict[str, Floats]:
 
 
 class Ruler:
-    """Measures solutions of one scene against a reference.
-
-    Attributes:
-        scale: norm of the reference per field.
-    """
+    """Measures solutions of one scene against a reference, whose norms per field are `scale`."""
 
     def __init__(self, scene: Scene, reference: FieldArrays) -> None:
-        """Take the norms of the reference.
-
-        Raises:
-            LayoutError: the reference is not one for this scene.
-        """
         for name, size in scene.sizes.items():
             if name not in reference or reference[name].shape != (size,):
                 raise LayoutError(f"reference: {name} is not there with {size} entries; compute it anew for this scene")
@@ -401,10 +367,7 @@ def backward_error(scene: Scene, solution: FieldArrays, of: FieldArrays | None =
         fieldwise       the largest over the fields of |b - J x| / |s| in its rows, which no scaling of whole fields and
                         no units change; what `field_conditions` bound errors by
 
-    Args:
-        scene: with all rows.
-        solution: all rows of each field.
-        of: the residual, where it is known, maybe to better than double precision.
+    All rows of a scene and of its solution; `of` is the residual, where it is known to better than double precision.
     """
     if of is None:
         known = {f: np.array(scene.rhs[f]) for f in scene.fields}
@@ -434,14 +397,7 @@ def field_conditions(scene: Scene, solution: FieldArrays) -> dict[str, float]:
     error of at most sqrt(fields) eta times it; no scaling of equations by field and no units change it. Estimated from
     below, by power iteration with the factors of the equilibrated matrix.
 
-    Local, on one rank.
-
-    Args:
-        scene: with all rows.
-        solution: accurate.
-
-    Returns:
-        Per field; infinite where the field's solution is zero.
+    Local, for a whole scene and its accurate solution; infinite where a field's solution is zero.
 
     Raises:
         SolveError: the matrix cannot be factorised.
@@ -485,11 +441,7 @@ def write(reference: Reference, path: str | os.PathLike[str]) -> None:
 
 
 def read(path: str | os.PathLike[str]) -> Reference:
-    """Read what `write` wrote.
-
-    Raises:
-        SceneError: the file is not there or no reference.
-    """
+    """Read what `write` wrote; a SceneError where it is not there or no reference."""
     try:
         with np.load(path) as arrays:
             about = json.loads(str(arrays["about"]))
@@ -511,10 +463,8 @@ def made(scene: str | os.PathLike[str], target: Path) -> Reference:
 
     from petsc_fs.tools.measure import environment
 
-    if target.exists():
-        found = read(target)
-        if found.scene_digest == digest(scene):
-            return found
+    if target.exists() and (found := read(target)).scene_digest == digest(scene):
+        return found
     target.parent.mkdir(parents=True, exist_ok=True)
     said = ""
     for method in ("auto", "iterative"):

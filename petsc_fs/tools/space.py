@@ -162,11 +162,7 @@ def shipped() -> list[Path]:
 
 
 def find_space(name: str) -> Path:
-    """Path of a space: as given, or else one that is shipped under this name.
-
-    Raises:
-        UsageError: there is none.
-    """
+    """Path of a space: as given, or else one that is shipped under this name; a UsageError where there is none."""
     path = Path(name)
     if path.is_file():
         return path
@@ -177,11 +173,7 @@ def find_space(name: str) -> Path:
 
 
 def read(path: Path) -> Space:
-    """Read a space.
-
-    Raises:
-        UsageError: the file cannot be read or makes no sense; the message names the parameter and the remedy.
-    """
+    """Read a space; a UsageError names the parameter that makes no sense, and the remedy."""
     import yaml
 
     try:
@@ -380,12 +372,9 @@ def _start(spec: Mapping[str, Any], parameter: Parameter, given: Mapping[str, st
 
 
 def edit(text: str, changes: Mapping[str, str | None]) -> str:
-    """An options file with some options changed, and its comments and nesting kept.
+    """An options file with some options changed, by full name, and its comments and nesting kept.
 
-    Args:
-        text: of the file, as `petsc_fs.options.parse` reads it.
-        changes: options by full name without the dash. None takes an option out; one that the file does not have
-            comes after the options that are nearest to it, in their prefix.
+    None takes an option out; one that the file does not have comes after those nearest to it, in their prefix.
     """
     lines = text.splitlines()
     places: list[tuple[str, str]] = []  # of each line: prefix in force, full name of its option or nothing

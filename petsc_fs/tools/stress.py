@@ -27,7 +27,7 @@ from petsc_fs import options
 from petsc_fs.errors import SolveError, UsageError
 from petsc_fs.io import hdf5
 from petsc_fs.io.files import write_text
-from petsc_fs.tools.measure import Job, Record, Variant, measure_all, seconds_of, split_ranks
+from petsc_fs.tools.measure import Job, Record, Variant, measure_all, positive, seconds_of, split_ranks
 from petsc_fs.tools.pages import markdown
 from petsc_fs.tools.stress_cases import StressCase, catalogue, held_out
 
@@ -181,11 +181,7 @@ def merge(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def read_report(path: Path) -> dict[str, Any]:
-    """A report as `--report` wrote it.
-
-    Raises:
-        UsageError: it is none.
-    """
+    """A report as `--report` wrote it; a UsageError where it is none."""
     try:
         found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         if not {"command", "cases", "findings"} <= set(found):
@@ -199,18 +195,7 @@ def read_report(path: Path) -> dict[str, Any]:
 
 
 def write_page(found: Mapping[str, Any], target: Path) -> list[Path]:
-    """Write a page in Markdown, and beside it the picture that it shows: cases by files, coloured by outcome.
-
-    Args:
-        found: what `report` gives.
-        target: page; the picture is called like it.
-
-    Returns:
-        Both files.
-
-    Raises:
-        UsageError: matplotlib is missing, or a file cannot be written.
-    """
+    """Write a report as a page in Markdown, and beside it, called like it, the picture that it shows; both files."""
     from petsc_fs.tools.plots import plot_matrix
 
     picture = plot_matrix(found["cases"], found["findings"], list(OUTCOMES), target.with_suffix(".png"))
@@ -227,11 +212,8 @@ def write_page(found: Mapping[str, Any], target: Path) -> list[Path]:
         f"![Outcome of each case with each options file]({picture.name})",
         "",
     ]
-    for title, mine in (
-        ("Catalogue", [f for f in found["findings"] if f["case"] not in held]),
-        ("Held out", [f for f in found["findings"] if f["case"] in held]),
-    ):
-        if mine:
+    for title, drawn in (("Catalogue", False), ("Held out", True)):
+        if mine := [f for f in found["findings"] if (f["case"] in held) == drawn]:
             lines += [f"## {title}: {len({f['case'] for f in mine})} cases", "", *markdown(*_by_file(mine)), ""]
     lines += ["## Cases", "", *markdown(*_cases(found)), ""]
     lines += [f"Condition: of the worst field. Iterations and error: of {DEFAULT}."]
@@ -282,16 +264,17 @@ count as none of these."""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `petsc-fs stress`."""
     parser.epilog = EPILOG
-    parser.add_argument("--suite", choices=SUITES, default="quick", help="default %(default)s")
-    parser.add_argument("--ranks", type=int, nargs="+", metavar="N", help="numbers of ranks, as -n; default 1")
-    parser.add_argument("--only", nargs="+", metavar="CASE", help="these cases instead of a suite")
-    parser.add_argument("--files", nargs="+", metavar="FILE", help=f"these options files only; also {DEFAULT}, {RETRY}")
-    parser.add_argument("--list", action="store_true", help="print the catalogue and end")
-    parser.add_argument("--report", type=Path, metavar="FILE.json", help="write everything that was found")
-    parser.add_argument("--read", type=Path, nargs="+", metavar="FILE.json", help="read reports instead of solving")
-    parser.add_argument("--page", type=Path, metavar="FILE.md", help="write it as a page, with a picture beside it")
-    parser.add_argument("--time-limit", type=float, default=60.0, metavar="S", help="of one solve; default %(default)s")
-    parser.add_argument("--mpiexec", metavar="PROGRAM", help="that starts ranks")
+    add = parser.add_argument
+    add("--suite", choices=SUITES, default="quick", help="default %(default)s")
+    add("--ranks", type=positive(int), nargs="+", metavar="N", help="numbers of ranks, as -n; default 1")
+    add("--only", nargs="+", metavar="CASE", help="these cases instead of a suite")
+    add("--files", nargs="+", metavar="FILE", help=f"these options files only; also {DEFAULT}, {RETRY}")
+    add("--list", action="store_true", help="print the catalogue and end")
+    add("--report", type=Path, metavar="FILE.json", help="write everything that was found")
+    add("--read", type=Path, nargs="+", metavar="FILE.json", help="read reports instead of solving")
+    add("--page", type=Path, metavar="FILE.md", help="write it as a page, with a picture beside it")
+    add("--time-limit", type=positive(float), default=60.0, metavar="S", help="of one solve; default %(default)s")
+    add("--mpiexec", metavar="PROGRAM", help="that starts ranks")
 
 
 def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
@@ -347,11 +330,7 @@ def describe(finding: Finding) -> str:
 
 
 def _chosen(args: argparse.Namespace) -> list[StressCase]:
-    """The cases of a call.
-
-    Raises:
-        UsageError: there is no such case.
-    """
+    """The cases of a call; a UsageError where there is no such case."""
     known = {case.name: case for case in [*catalogue(), *held_out()]}
     for name in args.only or ():
         if name not in known:

@@ -41,31 +41,18 @@ Factors = Mapping[str, float | NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Recipe:
-    """A linear system of a PorePy model with changed parameters.
+    """A linear system of a PorePy model with changed parameters, see `petsc_fs.porepy.cases`."""
 
-    Attributes:
-        group: heading under which it is listed.
-        hard: what makes it hard, in a line.
-        model: name in `petsc_fs.porepy.cases.CASES`.
-        refinement: cells are 100 m / refinement wide.
-        step: time step, from 1, and Newton step, from 0; the last one before it where Newton's method ends earlier.
-        parameters: of `petsc_fs.porepy.cases.ModelParameters`.
-        rock: of `petsc_fs.porepy.cases.Rock`; also `storage`, 1/M in 1/Pa.
-        case: changes of `petsc_fs.porepy.cases.Case`.
-        twist: changes that no parameter makes, see `scripts/stress_scenes`.
-        quick: see `StressCase`.
-    """
-
-    group: str
-    hard: str
+    group: str  # heading under which it is listed
+    hard: str  # what makes it hard, in a line
     model: str = "model2"
-    refinement: float = 0.3
-    step: tuple[int, int] = (1, 1)
-    parameters: Mapping[str, Any] = field(default_factory=dict)
-    rock: Mapping[str, Any] = field(default_factory=dict)
-    case: Mapping[str, Any] = field(default_factory=dict)
-    twist: Mapping[str, Any] = field(default_factory=dict)
-    quick: bool = False
+    refinement: float = 0.3  # cells are 100 m / refinement wide
+    step: tuple[int, int] = (1, 1)  # time step, from 1, and Newton step, from 0, or the last one before it
+    parameters: Mapping[str, Any] = field(default_factory=dict)  # of `ModelParameters`
+    rock: Mapping[str, Any] = field(default_factory=dict)  # of `Rock`; also `storage`, 1/M in 1/Pa
+    case: Mapping[str, Any] = field(default_factory=dict)  # changes of `Case`
+    twist: Mapping[str, Any] = field(default_factory=dict)  # what no parameter says, see `scripts/stress_scenes`
+    quick: bool = False  # see `StressCase`
 
 
 def _frozen(value: Any) -> Any:
@@ -101,11 +88,7 @@ def _unpacked(path: Path) -> Any:
 
 
 def load(name: str) -> Scene:
-    """A scene by name: of a recipe, or of a bundled file such as `model1.h5`.
-
-    Raises:
-        SceneError: there is none.
-    """
+    """A scene by name: of a recipe, or of a bundled file such as `model1.h5`; a SceneError where there is none."""
     if name.endswith(".h5"):
         return hdf5.read(COLLECTION.parent.parent / name)
     path = COLLECTION if name in RECIPES else HELD_OUT_COLLECTION
@@ -273,27 +256,16 @@ NAMED: dict[str, Callable[..., Scene]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class StressCase:
-    """One extreme scene.
-
-    Attributes:
-        name: of the case.
-        group: heading under which it is listed.
-        hard: what makes it hard, in a line.
-        source: where it comes from, in words.
-        make: the scene.
-        quick: whether `--suite quick` has it.
-        singular: whether the matrix is singular, so that no solution or no single one exists.
-        solvable: whether there is a solution, so that one that is handed on can be right.
-    """
+    """One extreme scene."""
 
     name: str
-    group: str
-    hard: str
-    source: str
+    group: str  # heading under which it is listed
+    hard: str  # what makes it hard, in a line
+    source: str  # where it comes from, in words
     make: Callable[[], Scene]
-    quick: bool = False
-    singular: bool = False
-    solvable: bool = True
+    quick: bool = False  # whether `--suite quick` has it
+    singular: bool = False  # whether the matrix is singular, so that no solution or no single one exists
+    solvable: bool = True  # whether there is a solution, so that one that is handed on can be right
 
     @property
     def held_out(self) -> bool:
@@ -304,8 +276,8 @@ class StressCase:
     def exported(cls, name: str, recipe: Recipe) -> StressCase:
         """A case that a PorePy model was exported for."""
         source = f"PorePy, {recipe.model}, step {recipe.step[0]}:{recipe.step[1]}"
-        make = partial(load, name)
-        return cls(name=name, group=recipe.group, hard=recipe.hard, source=source, make=make, quick=recipe.quick)
+        known: dict[str, Any] = {"group": recipe.group, "hard": recipe.hard, "source": source}
+        return cls(name=name, make=partial(load, name), quick=recipe.quick, **known)
 
     @classmethod
     def transformed(cls, name: str, base: str, change: str, **known: Any) -> StressCase:
@@ -338,15 +310,9 @@ def held_out() -> list[StressCase]:
     found = [StressCase.exported(name, recipe) for name, recipe in HELD_OUT.items()]
     for k in range(TRANSFORMED):
         base = BASES[k % len(BASES)]
-        found.append(
-            StressCase(
-                name=f"held_out_{base.removesuffix('.h5')}_{k:02}",
-                group=HELD,
-                hard="; ".join(_drawn(k)[0]),
-                source=f"{base}, random changes",
-                make=partial(_changed, base, partial(_drawn_change, number=k)),
-            )
-        )
+        known: dict[str, Any] = {"name": f"held_out_{base.removesuffix('.h5')}_{k:02}", "hard": "; ".join(_drawn(k)[0])}
+        make = partial(_changed, base, partial(_drawn_change, number=k))
+        found.append(StressCase(group=HELD, source=f"{base}, random changes", make=make, **known))
     return found
 
 
@@ -398,17 +364,13 @@ def _material(scene: Scene, random: np.random.Generator) -> Scene:
 
 CHANGES: dict[str, Callable[[Scene, np.random.Generator], Scene]] = {
     "random units": _units,
-    "equations of each field times a number over 8 decades": lambda scene, random: scaled(
-        scene, rows=_powers(scene, random, 4)
-    ),
-    "unknowns of each field times a number over 12 decades": lambda scene, random: scaled(
-        scene, columns=_powers(scene, random, 6)
-    ),
+    "equations of each field times a number over 8 decades": lambda s, random: scaled(s, rows=_powers(s, random, 4)),
+    "unknowns of each field times a number over 12 decades": lambda s, random: scaled(s, columns=_powers(s, random, 6)),
     "equations of one field scattered over 1 to 5 decades": _scattered_rows,
     "unknowns of one field scattered over 1 to 3 decades": _scattered_columns,
     "random right-hand side": _rhs,
-    "right-hand side times a number over 120 decades": lambda scene, random: with_rhs_scaled(
-        scene, float(10.0 ** random.uniform(-60, 60))
+    "right-hand side times a number over 120 decades": lambda s, r: with_rhs_scaled(
+        s, float(10.0 ** r.uniform(-60, 60))
     ),
     "stiffness that fixed stress is told off by up to 10": _material,
 }

@@ -35,7 +35,7 @@ from petsc_fs.errors import SolveError, UsageError
 from petsc_fs.io import hdf5
 from petsc_fs.io.files import write_text
 from petsc_fs.tools import measure
-from petsc_fs.tools.measure import positive, say
+from petsc_fs.tools.measure import make_folder, positive, say
 from petsc_fs.tools.pages import markdown
 from petsc_fs.tools.space import Space, Value, find_space, label, read
 
@@ -199,16 +199,13 @@ class Sweep:
         self._elapsed: dict[Path, float] = {}  # seconds of a process with the base file
 
     def run(self) -> Results:
-        """Search, or go on with it, choose the best file and measure it on the scenes held out.
-
-        Returns:
-            What came out, see `results`.
+        """Search, or go on with it, choose the best file and measure it on the scenes held out; see `results`.
 
         Raises:
             UsageError: the folder holds another sweep, or a scene does not fit the base file.
             SolveError: the base file does not solve a scene.
         """
-        (self.settings.out / "trials").mkdir(parents=True, exist_ok=True)
+        make_folder(self.settings.out / "trials")
         with _alone(self.settings.out):
             self.study = self._open()
             self._recover()
@@ -231,9 +228,9 @@ class Sweep:
 
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        settings, storage, identity = self.settings, self._storage(), self.settings.identity()
-        directions = ["minimize"] * len(settings.objective)
-        study = optuna.create_study(storage=storage, study_name="sweep", directions=directions, load_if_exists=True)
+        settings, identity = self.settings, self.settings.identity()
+        how = {"directions": ["minimize"] * len(settings.objective), "load_if_exists": True}
+        study = optuna.create_study(storage=self._storage(), study_name="sweep", **how)
         there = study.user_attrs.get("identity", identity)
         other = next((key for key in identity if there.get(key) != identity[key]), None)
         if other is not None:
@@ -291,18 +288,11 @@ class Sweep:
 
     def _job(self, scene: Path, file: Path | None = None, time_limit: float | None = None) -> measure.Job:
         reference = self._reference(scene)
-        return measure.Job(
-            scenes=[scene],
-            options_file=file,
-            ranks=self.settings.ranks,
-            rtols=(self.settings.tolerance,),
-            repetitions=self.settings.repetitions,
-            warm_up=self._elapsed.get(scene, 0.0) < SHORT,
-            errors=reference is not None,
-            references={} if reference is None else {str(scene): str(reference)},
-            time_limit=time_limit or self.settings.time_limit,
-            memory_limit=self.settings.memory_limit,
-        )
+        settings, references = self.settings, {} if reference is None else {str(scene): str(reference)}
+        how: dict[str, Any] = {name: getattr(settings, name) for name in ("ranks", "repetitions", "memory_limit")}
+        how |= {"rtols": (settings.tolerance,), "time_limit": time_limit or settings.time_limit}
+        how |= {"warm_up": self._elapsed.get(scene, 0.0) < SHORT, "errors": reference is not None}
+        return measure.Job(scenes=[scene], options_file=file, references=references, **how)
 
     def _reference(self, scene: Path) -> Path | None:
         """File with the reference solution of a scene, made once; None where it cannot be."""
@@ -319,11 +309,7 @@ class Sweep:
         return target if target.exists() else None
 
     def _base(self, scene: Path) -> None:
-        """Measure the base file.
-
-        Raises:
-            SolveError: it does not solve the scene.
-        """
+        """Measure the base file; a SolveError where it does not solve the scene."""
         started = time.monotonic()
         records = measure.measure(self._job(scene, self.settings.space.base))
         outcome, message = judge(records)
@@ -535,10 +521,7 @@ def _alone(folder: Path) -> Iterator[None]:
 def write(results: Results, folder: Path, page: Path | None = None) -> list[Path]:
     """Write best.opts, sweep.json, front.png and report.md into the folder of a sweep; the files written.
 
-    Args:
-        results: of `Sweep.run`.
-        folder: of the sweep.
-        page: where the report goes as well, with its picture beside it.
+    The report goes to `page` as well, with its picture beside it.
     """
     written = [folder / "sweep.json"]
     write_text(written[0], json.dumps(results, indent=2) + "\n")
@@ -680,11 +663,7 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
 
 
 def _settings(args: argparse.Namespace) -> Settings:
-    """The settings that arguments stand for.
-
-    Raises:
-        UsageError: they make no sense together, or a package is missing.
-    """
+    """The settings that arguments stand for; a UsageError if they make no sense together, or a package is missing."""
     from petsc_fs.io.bundled import find_scene
 
     try:
