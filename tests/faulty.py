@@ -1,16 +1,9 @@
 """Preconditioners that go wrong, for tests of what becomes of it."""
 
-import os
-import signal
 import time
 
 import numpy as np
 from petsc4py import PETSc
-
-
-class Crashing:
-    def setUp(self, pc: PETSc.PC) -> None:
-        os.kill(os.getpid(), signal.SIGSEGV)
 
 
 class Hanging:
@@ -21,9 +14,3 @@ class Hanging:
 class Hungry:
     def setUp(self, pc: PETSc.PC) -> None:
         self.much = np.empty(2**38)  # two terabytes
-
-
-class Growing:
-    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        x.copy(y)
-        y.scale(1e9)

@@ -482,9 +482,9 @@ def _measure(args: argparse.Namespace, petsc: list[str]) -> Comparison:
                 say(f"reference solution of {case.label}")
                 references[case.path] = os.fspath(args.out / f"reference_{case.label}.npz")
                 cases[k] = replace(case, reference=reference.made(case.path, Path(references[case.path])).about())
-        job = Job(rtols=rtols, warm_up=True, errors=True, references=references, time_limit=args.time_limit)
-        how: dict[str, Any] = {"ranks": ranks, "repeat": args.repeat, "fits": fits, "mpiexec": args.mpiexec}
-        for found in measure.measure_all(list(by_path), variants, job, **how):
+        how: dict[str, Any] = {"time_limit": args.time_limit, "mpiexec": args.mpiexec, "warm_up": True, "errors": True}
+        job = Job(rtols=rtols, references=references, **how)
+        for found in measure.measure_all(list(by_path), variants, job, ranks=ranks, repeat=args.repeat, fits=fits):
             records += found
             for r in (r for r in found if r["kind"] != "converged"):
                 where = f"{by_path[r['scene']].label}, {r['variant']}, {r['ranks']} rank(s)"

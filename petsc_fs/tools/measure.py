@@ -129,6 +129,7 @@ class Job:
     time_limit: float = 300.0  # seconds for each step: start and reading, set-up, one solve, errors
     memory_limit: int | None = None  # bytes of address space that each rank may have
     keep_going: bool = False  # whether the next scene follows after an error that all ranks raised
+    mpiexec: Path_ | None = None  # program that starts ranks; None for that of `find_mpiexec`
 
 
 @dataclass(frozen=True)
@@ -209,7 +210,6 @@ def measure_all(
     repeat: int = 1,
     fits: Callable[[str, Variant], bool] = lambda system, variant: True,
     batch: bool = False,
-    mpiexec: Path_ | None = None,
 ) -> Iterator[list[Record]]:
     """Measure all combinations, in turns: each once before any is measured again, the first variant another each time.
 
@@ -223,7 +223,6 @@ def measure_all(
         repeat: rounds.
         fits: whether a variant is to be measured on a system.
         batch: whether a process takes all systems, one after the other, and not one alone.
-        mpiexec: see `measure`.
 
     Yields:
         The records of a process, with `variant` (its label), `ranks` and `round` beside what `measure` gives. A
@@ -239,14 +238,14 @@ def measure_all(
             while left:
                 references = {s: job.references[s] for s in left if s in job.references}
                 what = replace(job, scenes=left, ranks=n, references=references)
-                found = measure(replace(what, options_file=v.path or None, options=v.options), mpiexec=mpiexec)
+                found = measure(replace(what, options_file=v.path or None, options=v.options))
                 hung |= {(r["scene"], v.label, n) for r in found if r["kind"] == "hang"}
                 yield [r | {"variant": v.label, "ranks": n, "round": number} for r in found]
                 done = {r["scene"] for r in found}
                 left = [s for s in left if s not in done]
 
 
-def measure(job: Job, *, mpiexec: Path_ | None = None) -> list[Record]:
+def measure(job: Job) -> list[Record]:
     """Measure in a process of its own and say how it ended: records in the order scene, repetition, tolerance.
 
     Blocks until the process has ended or was ended. Whatever happens in it is in the records; where it did not come
@@ -254,7 +253,7 @@ def measure(job: Job, *, mpiexec: Path_ | None = None) -> list[Record]:
     the process before it is raised here; where this process is killed, it ends, too (on Linux).
 
     Raises:
-        UsageError: there is no mpiexec, neither the one given nor that of `find_mpiexec`.
+        UsageError: there is no mpiexec.
     """
     with tempfile.TemporaryDirectory(prefix="petsc_fs-") as folder:
         events, request, output = (Path(folder) / name for name in ("events", "job.json", "output"))
@@ -263,7 +262,7 @@ def measure(job: Job, *, mpiexec: Path_ | None = None) -> list[Record]:
         program = [sys.executable, "-m", "petsc_fs.tools.probe", str(request), str(events)]
         with output.open("wb") as sink:
             process = subprocess.Popen(
-                [*launcher(job.ranks, mpiexec), *program],
+                [*launcher(job.ranks, job.mpiexec), *program],
                 stdin=subprocess.DEVNULL,
                 stdout=sink,
                 stderr=subprocess.STDOUT,

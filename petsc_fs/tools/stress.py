@@ -18,6 +18,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -116,26 +117,19 @@ def variants(more: Mapping[str, str | None]) -> list[Variant]:
     return [Variant(DEFAULT, options=more), Variant(RETRY, options=retried), *files]
 
 
-def run(
-    cases: Sequence[Case],
-    chosen: Sequence[Variant],
-    *,
-    ranks: Sequence[int] = (1,),
-    time_limit: float = 60.0,
-    mpiexec: str | None = None,
-) -> Iterator[Finding]:
-    """Solve every case by every variant that fits, on every number of ranks, one process at a time.
+def run(cases: Sequence[Case], chosen: Sequence[Variant], job: Job, ranks: Sequence[int] = (1,)) -> Iterator[Finding]:
+    """Solve every case by every variant that fits, on every number of ranks, one process at a time, as a job says.
 
     A process goes on from scene to scene; after one that ended by an error another process takes the rest.
     """
     by_path = {case["path"]: case for case in cases}
     references = {path: case["reference"] for path, case in by_path.items() if case["reference"]}
-    job = Job(errors=True, references=references, time_limit=time_limit, keep_going=True)
+    job = replace(job, errors=True, references=references, keep_going=True)
 
     def fits(system: str, variant: Variant) -> bool:
         return variant.fits(by_path[system]["fields"])
 
-    for records in measure_all(list(by_path), chosen, job, ranks=ranks, fits=fits, batch=True, mpiexec=mpiexec):
+    for records in measure_all(list(by_path), chosen, job, ranks=ranks, fits=fits, batch=True):
         found = [judge(by_path[record["scene"]], record) for record in records]
         words = ", ".join(f"{n} {outcome}" for outcome, n in Counter(f["outcome"] for f in found).items())
         _say(f"{found[0]['file']}{_on(found[0]['ranks'])}: {words}")
@@ -302,8 +296,8 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
         with tempfile.TemporaryDirectory(prefix="petsc_fs-stress-") as folder:
             prepared = prepare(cases, Path(folder))
             _say(f"{len(prepared)} scenes, {sum(bool(c['reference']) for c in prepared)} with a reference solution")
-            how: dict[str, Any] = {"time_limit": args.time_limit, "mpiexec": args.mpiexec}
-            findings = list(run(prepared, [known[n] for n in args.files or known], ranks=ranks, **how))
+            job = Job(time_limit=args.time_limit, mpiexec=args.mpiexec)
+            findings = list(run(prepared, [known[n] for n in args.files or known], job, ranks))
         words = f"--only {' '.join(args.only)}" if args.only else f"--suite {args.suite}"
         found = report(prepared, findings, f"petsc-fs stress {words} --ranks {' '.join(map(str, ranks))}")
     if args.report is not None:
