@@ -34,7 +34,7 @@ import math
 import os
 import re
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -114,21 +114,21 @@ class Space:
     base: Path  # options file
     parameters: tuple[Parameter, ...]  # each after those that its `when` names
 
-    def suggest(self, trial: Any) -> dict[str, Value]:
-        """The values that a sampler takes for all parameters that exist together."""
-        values: dict[str, Value] = {}
+    def values(self, choose: Callable[[Parameter], Value | None]) -> dict[str, Value]:
+        """What is chosen for all parameters that exist together; nothing where that is None."""
+        found: dict[str, Value] = {}
         for parameter in self.parameters:
-            if parameter.active(values):
-                values[parameter.name] = parameter.suggest(trial)
-        return values
+            if parameter.active(found) and (value := choose(parameter)) is not None:
+                found[parameter.name] = value
+        return found
+
+    def suggest(self, trial: Any) -> dict[str, Value]:
+        """The values that a sampler takes."""
+        return self.values(lambda parameter: parameter.suggest(trial))
 
     def start(self) -> dict[str, Value]:
         """The values of the first trial, as far as they are given."""
-        values: dict[str, Value] = {}
-        for parameter in self.parameters:
-            if parameter.start is not None and parameter.active(values):
-                values[parameter.name] = parameter.start
-        return values
+        return self.values(lambda parameter: parameter.start)
 
     def grid(self) -> list[dict[str, Value]]:
         """All combinations of values on the grid, each once: parameters that do not exist do not multiply them."""
