@@ -379,32 +379,13 @@ def test_printed_options_solve_to_the_last_digit_as_without(tmp_path, name):
 MISSPELT = "qr_fieldsplit_1_fieldsplit_mechanics_component_pc_hypre_boomeramg_stong_threshold"
 
 
-@pytest.mark.parametrize("ranks", [1, 2])
-@pytest.mark.parametrize("origin", ["the command line", "mine.opts", "PETSC_OPTIONS"])
-def test_misspelt_option_is_told_with_its_origin(tmp_path, origin, ranks):
-    (tmp_path / "mine.opts").write_text(
-        f"{choice_of(load('model1')).text('mine')}\n-{MISSPELT} 0.7\n" if origin == "mine.opts" else ""
-    )
-    arguments = {"the command line": [f"-{MISSPELT}", "0.7"], "mine.opts": ["-options_file", "mine.opts"]}
-    environment = {"PETSC_OPTIONS": f"-{MISSPELT} 0.7"} if origin == "PETSC_OPTIONS" else {}
-    done = petsc_fs("solve", "model1.h5", *arguments.get(origin, []), cwd=tmp_path, ranks=ranks, **environment)
-    assert done.returncode == (0 if environment else 2), done.stderr
-    assert done.stderr.count("petsc-fs: warning: ") == len(environment)
+def test_misspelt_option_of_a_file_is_told_once(tmp_path):
+    """Others: see test_cli."""
+    (tmp_path / "mine.opts").write_text(f"{choice_of(load('model1')).text('mine')}\n-{MISSPELT} 0.7\n")
+    done = petsc_fs("solve", "model1.h5", "-options_file", "mine.opts", cwd=tmp_path, ranks=2)
     right = MISSPELT.replace("stong", "strong")
-    message = f"option -{MISSPELT} from {origin} was not used; did you mean -{right}"
-    assert done.stderr.count(message) == 1
-    assert "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize("ranks", [1, 2])
-def test_option_that_may_be_idle_is_let_pass(tmp_path, ranks):
-    idle = [f"-{MISSPELT}", "0.7", "-petsc_fs_allow_unused", "mine_*,*stong*"]
-    done = petsc_fs("solve", "model1.h5", *idle, cwd=tmp_path, ranks=ranks)
-    assert done.returncode == 0, done.stderr
-    done = petsc_fs("solve", "model1.h5", *idle, "-yours_x", "1", cwd=tmp_path, ranks=ranks)
     assert done.returncode == 2
-    assert "option -yours_x from the command line was not used" in done.stderr
-    assert "stong" not in done.stderr
+    assert done.stderr.count(f"option -{MISSPELT} from mine.opts was not used; did you mean -{right}") == 1
 
 
 PARTS = {
