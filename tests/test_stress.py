@@ -57,7 +57,7 @@ def solve():
 def worst_error(scene, solution):
     """Of all fields, against a reference."""
     exact = reference.solve(scene, "direct").solution
-    return max(reference.Ruler(scene, exact).errors(solution)[1].values())
+    return max(reference.forward_error(scene, exact, solution)[1].values())
 
 
 def test_the_catalogue_has_enough_cases_and_says_what_is_hard():

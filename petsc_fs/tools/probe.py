@@ -108,7 +108,7 @@ class Probe:
         self.inserted: tuple[str, ...] = ()
         self.steps: list[tuple[Scene, Layout, float | None]] = []  # with the tolerance that the run had
         self.solver: Solver | None = None
-        self.errors: Callable[[Any], Record] | None = None  # of a solution; on rank 0, once there is one
+        self.truth: tuple[Scene, Mapping[str, Any] | None] | None = None  # with the reference; on rank 0, once needed
 
     def run(self) -> bool:
         """Measure all repetitions; whether all ended by a verdict. Collective."""
@@ -262,34 +262,31 @@ class Probe:
     def _compute_errors(self, solved: list[tuple[int, Any]]) -> None:
         """Forward and backward errors of solutions, each with the number of its record. Collective."""
         from petsc_fs.io import hdf5
+        from petsc_fs.tools import reference
 
         self.log.phase("errors")
         with together(self.comm):
-            if self.comm.rank == 0 and self.errors is None:
-                self.errors = _errors(hdf5.read(self.path), self.job.references.get(os.fspath(self.path)))
+            if self.comm.rank == 0 and self.truth is None:
+                file = self.job.references.get(os.fspath(self.path))
+                self.truth = hdf5.read(self.path), None if file is None else reference.read(file).solution
             for number, solution in solved:
-                if solution is not None and self.errors is not None:
-                    self.log.write({"supplement": number, **self.errors(solution)})
+                if solution is not None and self.truth is not None:
+                    self.log.write({"supplement": number, **_errors(*self.truth, solution)})
 
 
 def _sizes(layout: Layout) -> dict[str, int]:
     return {f: layout.sizes(f)[1] for f in layout.fields if layout.sizes(f)[1]}
 
 
-def _errors(scene: Scene, reference: Path_ | None) -> Callable[[Any], Record]:
-    """What gives backward errors of solutions of a scene, and forward errors where there is a reference. Local."""
-    from petsc_fs.tools import reference as references
+def _errors(scene: Scene, exact: Mapping[str, Any] | None, solution: Mapping[str, Any]) -> Record:
+    """Backward errors of a solution, and forward errors where an exact one is known. Local."""
+    from petsc_fs.tools.reference import backward_error, forward_error
 
-    ruler = None if reference is None else references.Ruler(scene, references.read(reference).solution)
-
-    def errors(solution: Mapping[str, Any]) -> Record:
-        found: Record = {"backward_error": references.backward_error(scene, solution)}
-        if ruler is not None:
-            total, by_field = ruler.errors(solution)
-            found |= {"forward_error": total, "error_by_field": by_field}
-        return found
-
-    return errors
+    found: Record = {"backward_error": backward_error(scene, solution)}
+    if exact is not None:
+        total, by_field = forward_error(scene, exact, solution)
+        found |= {"forward_error": total, "error_by_field": by_field}
+    return found
 
 
 def verdict(result: Result) -> str:

@@ -302,28 +302,25 @@ def weights(scene: Scene) -> dict[str, Floats]:
     return found
 
 
-class Ruler:
-    """Measures solutions of one scene against a reference, whose norms per field are `scale`."""
+def forward_error(scene: Scene, reference: FieldArrays, solution: FieldArrays) -> tuple[float, dict[str, float]]:
+    """Forward errors of a solution, all rows of each field.
 
-    def __init__(self, scene: Scene, reference: FieldArrays) -> None:
-        for name, size in scene.sizes.items():
-            if name not in reference or reference[name].shape != (size,):
-                raise LayoutError(f"reference: {name} is not there with {size} entries; compute it anew for this scene")
-        self._reference = reference
-        self._weights = {f: w for f, w in weights(scene).items() if w.size}
-        self.scale = {f: _norm(w, reference[f]) for f, w in self._weights.items()}
+    Returns:
+        Root mean square of the relative errors of the fields, so that each counts alike; relative error per
+        field. Where the reference is zero, the error of a field is absolute, and left out of the first.
 
-    def errors(self, solution: FieldArrays) -> tuple[float, dict[str, float]]:
-        """Forward errors of a solution, all rows of each field.
-
-        Returns:
-            Root mean square of the relative errors of the fields, so that each counts alike; relative error per
-            field. Where the reference is zero, the error of a field is absolute, and left out of the first.
-        """
-        absolute = {f: _norm(w, solution[f] - self._reference[f]) for f, w in self._weights.items()}
-        relative = {f: e / self.scale[f] for f, e in absolute.items() if self.scale[f]}
-        total = float(np.sqrt(np.mean(np.square(list(relative.values()))))) if relative else 0.0
-        return total, absolute | relative
+    Raises:
+        LayoutError: the reference is not one for this scene.
+    """
+    for name, size in scene.sizes.items():
+        if name not in reference or reference[name].shape != (size,):
+            raise LayoutError(f"reference: {name} is not there with {size} entries; compute it anew for this scene")
+    known = {f: w for f, w in weights(scene).items() if w.size}
+    absolute = {f: _norm(w, solution[f] - reference[f]) for f, w in known.items()}
+    scale = {f: _norm(w, reference[f]) for f, w in known.items()}
+    relative = {f: e / scale[f] for f, e in absolute.items() if scale[f]}
+    total = float(np.sqrt(np.mean(np.square(list(relative.values()))))) if relative else 0.0
+    return total, absolute | relative
 
 
 def _norm(weight: Floats, values: Floats) -> float:
