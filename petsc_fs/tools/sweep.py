@@ -34,7 +34,7 @@ from petsc_fs import options
 from petsc_fs.errors import SolveError, UsageError
 from petsc_fs.io import hdf5
 from petsc_fs.io.files import write_text
-from petsc_fs.tools import measure
+from petsc_fs.tools import measure, reference
 from petsc_fs.tools.measure import make_folder, positive, say
 from petsc_fs.tools.pages import markdown
 from petsc_fs.tools.space import Space, Value, find_space, label, read
@@ -123,11 +123,9 @@ class Settings:
 
     def identity(self) -> dict[str, str]:
         """What may not change when a sweep goes on."""
-        from petsc_fs.tools.reference import digest
-
         return {
             "format": "2",  # of what is stored of a trial
-            "scenes": " ".join(f"{path.name} ({digest(path)[:12]})" for path in self.scenes),
+            "scenes": " ".join(f"{path.name} ({reference.digest(path)[:12]})" for path in self.scenes),
             "space": json.dumps([repr(p) for p in self.space.parameters]),
             "base file": self.space.base.read_text(encoding="utf-8"),
             **{name: str(getattr(self, name)) for name in ("objective", "aggregate", "ranks", "tolerance", "clock")},
@@ -197,6 +195,7 @@ class Sweep:
         self._tried: dict[str, int] = {}  # what was changed: number of the trial
         self._recent: dict[Path, list[Summary]] = {}
         self._elapsed: dict[Path, float] = {}  # seconds of a process with the base file
+        self._references: dict[Path, Path | None] = {}
 
     def run(self) -> Results:
         """Search, or go on with it, choose the best file and measure it on the scenes held out; see `results`.
@@ -287,26 +286,22 @@ class Sweep:
     # --- measuring
 
     def _job(self, scene: Path, file: Path | None = None, time_limit: float | None = None) -> measure.Job:
-        reference = self._reference(scene)
-        settings, references = self.settings, {} if reference is None else {str(scene): str(reference)}
+        settings, exact = self.settings, self._reference(scene)
         how: dict[str, Any] = {name: getattr(settings, name) for name in ("ranks", "repetitions", "memory_limit")}
         how |= {"rtols": (settings.tolerance,), "time_limit": time_limit or settings.time_limit}
-        how |= {"warm_up": self._elapsed.get(scene, 0.0) < SHORT, "errors": reference is not None}
-        return measure.Job(scenes=[scene], options_file=file, references=references, **how)
+        how |= {"warm_up": self._elapsed.get(scene, 0.0) < SHORT, "errors": exact is not None}
+        return measure.Job(scenes=[scene], options_file=file, references={str(scene): exact} if exact else {}, **how)
 
     def _reference(self, scene: Path) -> Path | None:
         """File with the reference solution of a scene, made once; None where it cannot be."""
-        from petsc_fs.tools import reference
-
         target = self.settings.out / "references" / f"{scene.stem}-{reference.digest(scene)[:12]}.npz"
-        failed = target.with_suffix(".failed")
-        if not target.exists() and not failed.exists():
-            say(f"reference solution of {scene.name}")
-            try:
-                reference.made(scene, target)
-            except SolveError as e:
-                failed.write_text(str(e), encoding="utf-8")
-        return target if target.exists() else None
+        if scene not in self._references:
+            with contextlib.suppress(SolveError):
+                if not target.exists():
+                    say(f"reference solution of {scene.name}")
+                    reference.made(scene, target)
+            self._references[scene] = target if target.exists() else None
+        return self._references[scene]
 
     def _base(self, scene: Path) -> None:
         """Measure the base file; a SolveError where it does not solve the scene."""
