@@ -55,6 +55,7 @@ NUMBERS: dict[str, tuple[float, float, bool]] = {
     "ksp_gmres_restart": (1, math.inf, True),
 }
 """Least value, value that is too large, and whether it is a whole number, of options that end in these names."""
+NO_OPTION = "is not an option; options start with '-'"
 TAKE_FILES = ("options_file", "petsc_fs_retry", "petsc_fs_retry_file")
 
 
@@ -155,8 +156,8 @@ def _parse(path: Path, above: tuple[Path, ...]) -> Options:
     lines = []
     for number, line in enumerate(_text(path).split("\n"), start=1):
         words = re.findall(r"""["'][^"']*["']|\S+""", line.split("#")[0], re.ASCII)
-        if words and (words[0].startswith("--") or not is_option(words[0])):
-            raise UsageError(f"{path}:{number}: {words[0]!r} is not an option; options start with '-'")
+        if words and words[0].startswith("--"):
+            raise UsageError(f"{path}:{number}: {words[0]!r} {NO_OPTION}")
         lines.append((f"{path}:{number}: ", [word.strip("\"'") for word in words]))
     return _collect(lines, f"{path}: ", (*above, path.resolve()))
 
@@ -170,7 +171,8 @@ def _collect(lines: Iterable[tuple[str, Sequence[str]]], name: str, above: tuple
         while words:
             word = words.pop(0)
             if not is_option(word):
-                raise UsageError(f"{where}{word!r} belongs to no option: -{before} has its value already")
+                why = f"belongs to no option: -{before} has its value already" if before else NO_OPTION
+                raise UsageError(f"{where}{word!r} {why}")
             value = words.pop(0) if words and not is_option(words[0]) else None
             option = before = word.lstrip("-")
             _refuse_unclear(option, value, where)

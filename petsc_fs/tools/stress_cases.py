@@ -364,8 +364,8 @@ def _material(scene: Scene, random: np.random.Generator) -> Scene:
 
 CHANGES: dict[str, Callable[[Scene, np.random.Generator], Scene]] = {
     "random units": _units,
-    "equations of each field times a number over 8 decades": lambda s, random: scaled(s, rows=_powers(s, random, 4)),
-    "unknowns of each field times a number over 12 decades": lambda s, random: scaled(s, columns=_powers(s, random, 6)),
+    "equations of each field times a number over 8 decades": lambda s, r: scaled(s, rows=_powers(s, r, 4)),
+    "unknowns of each field times a number over 12 decades": lambda s, r: scaled(s, columns=_powers(s, r, 6)),
     "equations of one field scattered over 1 to 5 decades": _scattered_rows,
     "unknowns of one field scattered over 1 to 3 decades": _scattered_columns,
     "random right-hand side": _rhs,
