@@ -34,24 +34,14 @@ UNIT_SYSTEMS = ({}, {"m": 1e-3}, {"s": 3600.0}, {"kg": 1e10, "m": 1e-3, "s": 360
 comm = MPI.COMM_WORLD
 
 
-@pytest.fixture
-def solve():
-    """Solve a scene by its default solver, with further options: the result, and the whole solution on all ranks."""
-    inserted = []
-
-    def run(scene, **more):
-        inserted.extend(options.insert_all(more))
-        try:
-            solver = Solver(scene, comm)
-            result = solver.solve()
-            whole = comm.bcast(solver.system.gather(result.solution))
-            solver.destroy()
-            return result, whole
-        finally:
-            options.delete_all(inserted)
-            inserted.clear()
-
-    return run
+def solve(scene, **more):
+    """By the default solver, with further options: the result, and the whole solution on all ranks."""
+    with options.inserted(more):
+        solver = Solver(scene, comm)
+        result = solver.solve()
+        whole = comm.bcast(solver.system.gather(result.solution))
+        solver.destroy()
+    return result, whole
 
 
 def worst_error(scene, solution):
@@ -74,7 +64,7 @@ def test_exported_scenes_fit_together(name):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("units", UNIT_SYSTEMS, ids=str)
-def test_units_change_neither_answer_nor_accuracy(solve, units):
+def test_units_change_neither_answer_nor_accuracy(units):
     """The same answer, field by field, in four unit systems: what is left is what the tolerance leaves."""
     scene = load("base")
     exact, known = solve(scene, ksp_rtol="1e-13", ksp_atol="0")
@@ -102,7 +92,7 @@ def test_units_are_those_of_the_equations():
     [scaled(load("base"), rows={"mass": 1e-8}), with_block_of_cell(load("base"), "intf_force", 3, 1e-13)],
     ids=["mass balance hides", "D_22 of a cell nearly singular"],
 )
-def test_a_small_residual_alone_is_no_answer(solve, scene):
+def test_a_small_residual_alone_is_no_answer(scene):
     """A residual that is met at once, by an answer without a correct digit in a field that is small in its norm."""
     result, solution = solve(scene)
     assert not result.converged or worst_error(scene, solution) <= 1e-3
@@ -110,7 +100,7 @@ def test_a_small_residual_alone_is_no_answer(solve, scene):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("name", ["no_storage", "tiny_rhs"])
-def test_limits_have_an_answer(solve, name):
+def test_limits_have_an_answer(name):
     """No storage, where fixed stress has its limit; a right-hand side that meets any absolute tolerance at once."""
     scene = CASES[name].make()
     result, solution = solve(scene)
