@@ -190,24 +190,6 @@ def test_one_block_is_the_whole_matrix() -> None:
 # --- outcomes
 
 
-@pytest.fixture
-def bad_pc(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Module with Python PCs that misbehave when they are set up."""
-    (tmp_path / "bad_pc.py").write_text(
-        "import os, time\n"
-        "class Crash:\n    def setUp(self, pc): os.abort()\n"
-        "class Exit:\n    def setUp(self, pc): os._exit(3)\n"
-        "class Hang:\n    def setUp(self, pc): time.sleep(1000)\n"
-        "class Greedy:\n    def setUp(self, pc): self.much = bytearray(2**34)\n"
-        "from petsc_fs.errors import SolveError\n"
-        "class Lonely:\n    def setUp(self, pc):\n"
-        "        if pc.comm.rank: raise SolveError('only here')\n"
-        "        pc.comm.tompi4py().Barrier()\n"
-        "class Wrong:\n    def apply(self, pc, x, y): x.copy(y); y.scale(float('nan'))\n"
-    )
-    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
-
-
 def outcome(options: dict[str, str | None], **more: object) -> dict[str, Any]:
     base = {"scenes": [BIOT], "options_file": "poromechanics.opts", "options": options, "time_limit": 60.0}
     records = measure(Job(**(base | more)))  # type: ignore[arg-type]
@@ -217,7 +199,7 @@ def outcome(options: dict[str, str | None], **more: object) -> dict[str, Any]:
 
 
 def python(name: str) -> dict[str, str | None]:
-    return {"ksp_type": "gmres", "pc_type": "python", "pc_python_type": f"bad_pc.{name}"}
+    return {"ksp_type": "gmres", "pc_type": "python", "pc_python_type": f"tests.faulty.{name}"}
 
 
 def test_converged() -> None:
@@ -273,7 +255,6 @@ WILD = f"-ksp_type richardson\n-ksp_richardson_scale -30\n-ksp_max_it 4\n{ASSEMB
         ("unused_option", {"fieldsplit_momentum_pc_hypre_boomeramg_strong_treshold": "0.5"}, {}, "strong_threshold"),
     ],
 )
-@pytest.mark.usefixtures("bad_pc")
 def test_outcomes(kind: str, options: dict[str, str | None], more: dict[str, Any], said: str, tmp_path: Path) -> None:
     (tmp_path / "wild.opts").write_text(WILD)
     if more.get("options_file") == "wild.opts":
@@ -292,7 +273,7 @@ def test_crash_of_the_second_scene_keeps_the_first(tmp_path: Path) -> None:
     assert "HDF5" in records[1]["message"]
 
 
-def test_after_a_crash_another_process_takes_the_rest(bad_pc: None) -> None:
+def test_after_a_crash_another_process_takes_the_rest() -> None:
     crash = Variant("crash", options=python("Crash"))
     systems = [BIOT, str(SCENES / "flow.h5")]
     processes = list(measure_all(systems, [crash, Variant("default")], Job(time_limit=60.0), batch=True))
@@ -303,7 +284,7 @@ def test_after_a_crash_another_process_takes_the_rest(bad_pc: None) -> None:
     ]
 
 
-def test_hang_is_ended_with_all_its_ranks(bad_pc: None) -> None:
+def test_hang_is_ended_with_all_its_ranks() -> None:
     started = time.monotonic()
     found = outcome(python("Hang"), options_file=None, time_limit=4.0, ranks=2)
     assert (found["kind"], found["phase"]) == ("hang", "set-up")

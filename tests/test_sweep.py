@@ -467,8 +467,8 @@ groups:
       which:
         choices:
           good: {assembled_pc_factor_mat_solver_type: mumps}
-          hungry: {pc_python_type: tests.faulty.Hungry, assembled_pc_type: ~}
-          hanging: {pc_python_type: tests.faulty.Hanging, assembled_pc_type: ~}
+          hungry: {pc_python_type: tests.faulty.Greedy, assembled_pc_type: ~}
+          hanging: {pc_python_type: tests.faulty.Hang, assembled_pc_type: ~}
           misspelt: {assembled_pc_factor_mat_solver_tpye: mumps}
 """
 
@@ -476,8 +476,7 @@ EXPECTED = {"good": "solved", "hungry": "out_of_memory", "hanging": "hang", "mis
 """Outcomes of `petsc_fs.tools.measure`, see its tests; limits are those of the sweep."""
 
 
-def test_each_way_to_end_is_recorded_as_what_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(HERE.parent))
+def test_each_way_to_end_is_recorded_as_what_it_is(tmp_path: Path) -> None:
     make(tmp_path, FAULTY, FAULTY_BASE)
     out = tmp_path / "out"
     arguments = ["sweep", "flow.h5", "--space", str(tmp_path / "some.yaml"), "--sampler", "grid", "--trials", "20"]
