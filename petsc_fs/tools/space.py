@@ -34,7 +34,8 @@ import math
 import os
 import re
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -172,55 +173,59 @@ def find_space(name: str) -> Path:
     raise UsageError(f"space {name}: no such file; shipped are {', '.join(p.name for p in shipped())}")
 
 
+@contextmanager
+def _at(where: str) -> Iterator[None]:
+    """Say where an error was made."""
+    try:
+        yield
+    except UsageError as e:
+        raise UsageError(f"{where}: {e}") from e
+
+
 def read(path: Path) -> Space:
     """Read a space; a UsageError names the parameter that makes no sense, and the remedy."""
     import yaml
 
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        top = _mapping(content, "", ("description", "base", "groups"), required=("base", "groups"))
-        base = path.parent / str(top["base"])
-        try:
-            base = base if base.is_file() else options.find_options_file(str(top["base"]))
-            given = options.parse(base)
-        except UsageError as e:
-            raise UsageError(f"base: {e}") from e
-        parameters: dict[str, Parameter] = {}
-        for group, raw in _mapping(top["groups"], "groups: ").items():
-            entries = _mapping(raw, f"group {group}: ", ("prefix", "parameters"), required=("parameters",))
-            prefix = str(entries.get("prefix") or "").removeprefix("-")
-            _check_prefix(prefix, given, f"group {group}: ", base.name)
-            for name, spec in _mapping(entries["parameters"], f"group {group}: parameters: ").items():
-                full = f"{group}.{name}"
-                try:
-                    parameters[full] = _parameter(full, prefix, spec, parameters, given)
-                except UsageError as e:
-                    raise UsageError(f"parameter {full}: {e}") from e
-        if not parameters:
-            raise UsageError("no parameters; declare some under groups")
-        _check_unique(parameters.values())
     except (OSError, UnicodeDecodeError) as e:
         raise UsageError(f"space {path}: not readable as text: {e}") from e
     except yaml.YAMLError as e:
         raise UsageError(f"space {path}: not YAML: {' '.join(str(e).split())}") from e
-    except UsageError as e:
-        raise UsageError(f"space {path}: {e}") from e
+    parameters: dict[str, Parameter] = {}
+    with _at(f"space {path}"):
+        top = _mapping(content, ("description", "base", "groups"), required=("base", "groups"))
+        base = path.parent / str(top["base"])
+        with _at("base"):
+            base = base if base.is_file() else options.find_options_file(str(top["base"]))
+            given = options.parse(base)
+        for group, raw in _mapping(top["groups"]).items():
+            with _at(f"group {group}"):
+                entries = _mapping(raw, ("prefix", "parameters"), required=("parameters",))
+                prefix = str(entries.get("prefix") or "").removeprefix("-")
+                _check_prefix(prefix, given, base.name)
+                specs = _mapping(entries["parameters"])
+            for name, spec in specs.items():
+                full = f"{group}.{name}"
+                with _at(f"parameter {full}"):
+                    parameters[full] = _parameter(full, prefix, spec, parameters, given)
+        if not parameters:
+            raise UsageError("no parameters; declare some under groups")
+        _check_unique(parameters.values())
     return Space(path, str(top.get("description") or path.stem), base, tuple(parameters.values()))
 
 
-def _mapping(
-    raw: Any, where: str, allowed: Sequence[str] | None = None, required: Sequence[str] = ()
-) -> dict[str, Any]:
+def _mapping(raw: Any, allowed: Sequence[str] | None = None, required: Sequence[str] = ()) -> dict[str, Any]:
     """A mapping with names for keys, of which some are allowed and some required."""
     if not isinstance(raw, dict) or not all(isinstance(key, str) for key in raw):
-        raise UsageError(f"{where}expected a mapping of names, found {_shown(raw)}")
-    strange = next((key for key in raw if allowed is not None and key not in allowed), None)
-    if strange is not None and allowed is not None:
-        hint = _similar(strange, allowed) or f"expected {', '.join(allowed)}"
-        raise UsageError(f"{where}unknown entry {strange!r}; {hint}")
-    missing = next((key for key in required if key not in raw), None)
-    if missing is not None:
-        raise UsageError(f"{where}{missing!r} is missing")
+        raise UsageError(f"expected a mapping of names, found {_shown(raw)}")
+    for key in raw:
+        if allowed is not None and key not in allowed:
+            hint = _similar(key, allowed) or f"expected {', '.join(allowed)}"
+            raise UsageError(f"unknown entry {key!r}; {hint}")
+    for key in required:
+        if key not in raw:
+            raise UsageError(f"{key!r} is missing")
     return raw
 
 
@@ -233,12 +238,12 @@ def _similar(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
     return f"did you mean {found[0]}?" if found else ""
 
 
-def _check_prefix(prefix: str, given: Iterable[str], where: str, base: str) -> None:
+def _check_prefix(prefix: str, given: Iterable[str], base: str) -> None:
     stem = "".join(re.findall(rf".*{options.SPLIT}", prefix))  # what follows is a part of the options' own names
     if not any(name.startswith(stem) for name in given):
         splits = {name[: m.end()] for name in given for m in re.finditer(options.SPLIT, name)}
         hint = _similar(stem, splits, cutoff=0.3) or "leave it away for the outermost level"
-        raise UsageError(f"{where}no option of {base} has the prefix {stem!r}; {hint}")
+        raise UsageError(f"no option of {base} has the prefix {stem!r}; {hint}")
 
 
 def _check_unique(parameters: Iterable[Parameter]) -> None:
@@ -258,7 +263,7 @@ def _parameter(
     name: str, prefix: str, raw: Any, before: Mapping[str, Parameter], given: Mapping[str, str | None]
 ) -> Parameter:
     """One parameter from its entry in the file, after those before it."""
-    spec = _mapping(raw, "", (*EXTRAS, *EXTRAS["float"]))
+    spec = _mapping(raw, (*EXTRAS, *EXTRAS["float"]))
     kinds = [kind for kind in EXTRAS if kind in spec]
     if len(kinds) != 1:
         raise UsageError(f"expected exactly one of {', '.join(EXTRAS)}, found {', '.join(kinds) or 'none'}")
@@ -269,6 +274,8 @@ def _parameter(
     option = prefix + str(spec.get("option", name.partition(".")[2])).removeprefix("-")
     if not re.fullmatch(r"[A-Za-z_]\w*", option):
         raise UsageError(f"{option!r} is no name of an option; name it with 'option: NAME'")
+    with _at("when"):
+        when = _conditions(spec.get("when", {}), name, before)
     points = _positive(spec, "points", "integer") or GRID_POINTS
     if points < 2:
         raise UsageError(f"points {points:g}: a grid needs both ends; take at least 2")
@@ -281,7 +288,7 @@ def _parameter(
         step=_positive(spec, "step", kind),
         points=int(points),
         start=None,
-        when=_conditions(spec.get("when", {}), name, before),
+        when=when,
     )
     return replace(parameter, start=_start(spec, parameter, given))
 
@@ -294,7 +301,7 @@ def _choices(raw: Any, option: str, prefix: str) -> dict[str, Changes]:
         return found
     if not (isinstance(raw, dict) and raw):
         raise UsageError(f"choices: expected a list of values, or a mapping from names to options; found {_shown(raw)}")
-    entries = {str(name): _mapping(entry or {}, f"choice {name}: ") for name, entry in raw.items()}
+    entries = {str(name): _mapping(entry or {}) for name, entry in raw.items()}
     return {
         name: {prefix + key.removeprefix("-"): _text(value) for key, value in entry.items()}
         for name, entry in entries.items()
@@ -340,16 +347,16 @@ def _positive(spec: Mapping[str, Any], key: str, kind: str) -> float | None:
 
 def _conditions(raw: Any, name: str, before: Mapping[str, Parameter]) -> dict[str, tuple[str, ...]]:
     found = {}
-    for other, allowed in _mapping(raw, "when: ").items():
+    for other, allowed in _mapping(raw).items():
         full = other if "." in other else f"{name.partition('.')[0]}.{other}"
         if full not in before:
             hint = _similar(full, before) or "declare it before this one"
-            raise UsageError(f"when: there is no parameter {full} before this one; {hint}")
+            raise UsageError(f"there is no parameter {full} before this one; {hint}")
         found[full] = tuple(_text(v) or ABSENT for v in (allowed if isinstance(allowed, list) else [allowed]))
         choices = before[full].choices
-        never = next((wanted for wanted in found[full] if choices and wanted not in choices), None)
-        if never is not None:
-            raise UsageError(f"when: {full} is never {never!r}; its choices are {', '.join(choices)}")
+        for wanted in found[full] if choices else ():
+            if wanted not in choices:
+                raise UsageError(f"{full} is never {wanted!r}; its choices are {', '.join(choices)}")
     return found
 
 
