@@ -167,7 +167,8 @@ def test_command_from_scene_to_page(tmp_path: Path, capsys: pytest.CaptureFixtur
     call = ["compare", "biot.h5", "--options", *files, "--rtol", "1e-4,1e-8", "--repeat", "1", "--out", str(out)]
     assert main([*call, "-n", "1"]) == 0
     said = capsys.readouterr()
-    assert "misspelt" in said.err and "unused_option" in said.err and "poromechanics" in said.out
+    assert "misspelt" in said.err and "unused_option" in said.err
+    assert re.search("^biot .* s", said.out, re.MULTILINE)  # whichever file is the fastest one today
     pictures = {f"work_precision_biot.{suffix}" for suffix in ("png", "svg")}
     written = {p.name for p in out.iterdir()}
     assert written == pictures | {"compare.html", "compare.csv", "compare.json", "reference_biot.npz"}
