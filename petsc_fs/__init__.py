@@ -9,6 +9,7 @@ Importing this package neither initialises PETSc nor imports a simulator; what i
 """
 
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -18,14 +19,33 @@ if TYPE_CHECKING:
     from petsc_fs.solver import Solver
 
 __all__ = ["Scene", "Solver", "__version__", "hdf5", "options", "sequence"]
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 
 def __getattr__(name: str) -> Any:
     if name in ("Scene", "Solver"):
-        return getattr(import_module(f"petsc_fs.{name.lower()}"), name)
+        try:
+            return getattr(import_module(f"petsc_fs.{name.lower()}"), name)
+        except ModuleNotFoundError as e:
+            if e.name not in ("petsc4py", "mpi4py"):
+                raise
+            raise ImportError(missing(e)) from e
     if name in ("hdf5", "sequence"):
         return import_module(f"petsc_fs.io.{name}")
     if name == "options":
         return import_module("petsc_fs.options")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def missing(error: Exception) -> str:
+    """What to do where petsc4py or mpi4py cannot be imported, in a line.
+
+    They are no dependencies: they must be those of the machine's PETSc and MPI, and pip would compile PETSc.
+    """
+    there = sorted(Path("/usr/lib/petscdir").glob("petsc*/*-real/lib/python3/dist-packages"))  # outside Python's path
+    debian = f"export PYTHONPATH={there[-1]}" if there else "apt-get install python3-petsc4py-real python3-mpi4py"
+    return (
+        f"{' '.join(str(error).split())}: petsc4py and mpi4py come with the PETSc and MPI of the machine: on Debian "
+        f"{debian}; with conda, conda install -c conda-forge petsc4py mpi4py; else pip install 'petsc_fs[petsc]', "
+        "which compiles PETSc"
+    )

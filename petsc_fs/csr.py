@@ -138,6 +138,16 @@ def compressed(matrix: Any) -> tuple[CSR, int | None]:
     return block, int(matrix.shape[-1]) if hasattr(matrix, "shape") else None
 
 
+def with_ones(matrix: CSR, count: int) -> CSR:
+    """A square matrix with further rows and columns, which have 1 on the diagonal and nothing else."""
+    n = matrix.indptr.size - 1
+    return CSR(
+        np.append(matrix.indptr, matrix.indptr[-1] + np.arange(1, count + 1)),
+        np.append(matrix.indices, np.arange(n, n + count)),
+        np.append(matrix.data, np.ones(count)),
+    )
+
+
 def array_of(values: Any) -> NDArray[Any]:
     """As an array; an empty one of objects for lists of lists that have different lengths."""
     try:

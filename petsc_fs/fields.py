@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from petsc_fs.errors import UsageError
+
 
 @dataclass(frozen=True)
 class Field:
@@ -44,8 +46,32 @@ FIELDS = (
 FIELD = {field.name: field for field in FIELDS}
 FIELD_NAMES = tuple(FIELD)
 
+ALIASES: dict[str, str] = {}
+"""Fields by other names that files have for them, see `learn_aliases`."""
+
 MECHANICS = ("intf_force", "momentum")
 """Fields that one multigrid treats together, under the name "mechanics"."""
+
+
+def field_of(name: str) -> str:
+    """The field that a file means by a name, see `ALIASES`; also of a name that no field has."""
+    return ALIASES.get(name, name)
+
+
+def learn_aliases(text: str) -> None:
+    """Take names that files have for fields from words such as `u=momentum,p=mass`.
+
+    Raises:
+        UsageError: it cannot be read, or names no field.
+    """
+    for word in text.split(","):
+        name, _, field = (part.strip() for part in word.partition("="))
+        if not name or field not in FIELD:
+            raise UsageError(
+                f"--fields: cannot read {word!r}; expected NAME=FIELD, for example u=momentum,p=mass; fields are "
+                f"{', '.join(FIELD_NAMES)}"
+            )
+        ALIASES[name] = field
 
 
 def in_order(names: Iterable[str]) -> tuple[str, ...]:

@@ -312,6 +312,17 @@ def multiply(A: PETSc.Mat, x: NDArray[np.float64]) -> NDArray[np.float64]:
     return product
 
 
+def multiply_transposed(A: PETSc.Mat, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same with the transpose. Collective."""
+    right, left = A.createVecs()
+    left.setArray(x)
+    A.multTranspose(left, right)
+    product = np.array(right.getArray())
+    right.destroy()
+    left.destroy()
+    return product
+
+
 def multiply_absolute(A: PETSc.Mat, x: NDArray[np.float64]) -> NDArray[np.float64]:
     """|A| |x|, entry by entry. Collective."""
     M = magnitudes(A)

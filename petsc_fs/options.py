@@ -11,7 +11,6 @@ import math
 import os
 import re
 import signal
-import sysconfig
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -64,8 +63,9 @@ TAKE_FILES = ("options_file", "petsc_fs_retry", "petsc_fs_retry_file")
 
 def shipped_folder() -> Path:
     """Folder of the options files that come with this package."""
-    beside = Path(__file__).resolve().parent.parent / "options"
-    return beside if beside.is_dir() else Path(sysconfig.get_path("data")) / "share" / "petsc_fs"
+    home = Path(__file__).resolve().parent
+    inside = home / "options_files"
+    return inside if inside.is_dir() else home.parent / "options"  # in a checkout
 
 
 def find_options_file(name: str) -> Path:
@@ -537,7 +537,11 @@ def _level(name: str, levels: Iterable[str]) -> str:
 
 @dataclass(frozen=True)
 class Given:
-    """PETSc options of a call, which must not go unused."""
+    """PETSc options of a call, which must not go unused.
+
+    Options:
+        -petsc_fs_allow_unused <none> (patterns, separated by commas): options that may do nothing, such as my_*.
+    """
 
     typed: frozenset[str]  # names on the command line
     values: Options  # all of them, those of options files included, in the order in which they count

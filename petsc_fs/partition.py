@@ -58,6 +58,11 @@ class Layout:
     offsets: Mapping[str, Cells]
     cells: Mapping[str, Cells] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        sizes = ", ".join(f"{f} {self.sizes(f)[1]:,}" for f in self.fields)
+        ranks = self.comm.size
+        return f"<Layout, {self.dimension}D, on {ranks} rank{'s' if ranks > 1 else ''}: {sizes}>"
+
     @classmethod
     def contiguous(cls, comm: MPI.Intracomm, dimension: int, sizes: Mapping[str, int]) -> Layout:
         """Cells of each field, in the scene's order, cut into chunks of nearly equal length."""
@@ -187,8 +192,12 @@ def chosen(prefix: str = "") -> tuple[str, str]:
     """Kind of partition and ordering that the options say. Local.
 
     Options:
-        -petsc_fs_partition auto|rcb|ptscotch|contiguous: which rank gets which cells, see `partition`.
-        -petsc_fs_ordering auto|natural|morton: order of the cells of a rank, see `partition`.
+        -petsc_fs_partition <auto> (auto, rcb, ptscotch, contiguous): which rank gets which cells:
+            by bisection of their centres, by their graph, or in the order of the scene; auto is rcb where centres are
+            known, else contiguous.
+        -petsc_fs_mat_partitioning_*: of PETSc's MatPartitioning, where the kind is ptscotch.
+        -petsc_fs_ordering <auto> (auto, natural, morton): order of the cells of a rank: that of the scene, or along a
+            space-filling curve; auto is morton on ranks with many cells. Solutions come back in that of the scene.
 
     Raises:
         UsageError: a value is none of `KINDS` or `ORDERINGS`.

@@ -16,6 +16,10 @@ from petsc_fs.system import EPS, System, norm
 
 MOST_PASSES = 20
 """The Krylov method and its corrections."""
+HESSENBERG = ("gmres", "fgmres", "lgmres")
+"""Krylov methods that know singular values of what they have projected."""
+GMRES_RESTART = 30
+"""PETSc's default."""
 PETSC_ATOL = 1e-50
 """PETSc's own absolute tolerance, which stands for none."""
 HOPELESS = ("DIVERGED_DTOL", "DIVERGED_NANORINF", "DIVERGED_PC_FAILED", "DIVERGED_INDEFINITE_PC")
@@ -27,10 +31,14 @@ STRICTER = 1e-2
 """Factor on the tolerance of a correction after one that has gained little."""
 LEAST_RTOL = 1e-12
 """Tolerance of the Krylov method that its recursion can still keep."""
-WELL_DETERMINED = 1e-3
-"""Estimated relative error of each field up to which a solution is taken as it is."""
-DETERMINED = 1e-2
-"""Relative error of each field, where it is measured, up to which a solution counts as one."""
+DETERMINED = 1e-3
+"""Relative error of each field, estimated or measured, up to which a solution is taken as it is."""
+ACCEPTED = 1e-2
+"""The same where rounding allows no better one."""
+BALANCED = 1e-6
+"""Imbalance of a field from which a solution is in doubt."""
+NOISE = 2.0
+"""Size of a perturbation beside the residual."""
 FAR = 10.0
 """Factor by which a field misses its tolerance, from which the norm of the Krylov method has hidden something."""
 MEASURE = 0.1
@@ -41,6 +49,33 @@ MOST_IMPROVEMENTS = 3
 """Corrections for the sake of the estimated error."""
 LIMIT = 1e-14
 """Backward error that no correction lessens any more."""
+
+
+class Spectrum:
+    """The least singular value of A M^-1 that a GMRES has seen, where it starts again and where it ends.
+
+    Attributes:
+        least: this, or 1 if that is less; 1 for methods other than `HESSENBERG`.
+    """
+
+    least = 1.0
+
+    def __init__(self, ksp: PETSc.KSP) -> None:
+        """Watch a KSP whose options are set. Collective."""
+        self._restart = PETSc.Options(ksp.getOptionsPrefix() or "").getInt("ksp_gmres_restart", GMRES_RESTART)
+        if ksp.getType() in HESSENBERG:
+            ksp.setComputeSingularValues(True)  # of what it projects anyway
+            ksp.setMonitor(self._watch)
+        ksp.setAttr("spectrum", self)
+
+    def _watch(self, ksp: PETSc.KSP, iteration: int, _: float) -> None:
+        if iteration % self._restart == self._restart - 1:
+            self.look(ksp)
+
+    def look(self, ksp: PETSc.KSP) -> None:
+        """Take in what the KSP has seen since it started again. Local."""
+        if ksp.getType() in HESSENBERG and ksp.getIterationNumber():
+            self.least = min(self.least, max(float(ksp.computeExtremeSingularValues()[1]), EPS))
 
 
 class Refinement:
@@ -66,7 +101,8 @@ class Refinement:
         self.notes: tuple[str, ...] = ()
         self.estimates: dict[str, float] = {}
         self.is_determined = True
-        self._least = 1.0  # singular value of A M^-1 that GMRES has seen
+        self._spectrum: Spectrum = ksp.getAttr("spectrum")
+        self._spectrum.least = 1.0
         self._missed = 0.0  # by what factor a pass that met its own tolerance has missed that of a field
         self.x.set(0.0)
         self.check = system.check(None, self.r)
@@ -134,7 +170,7 @@ class Refinement:
     def _take_step(self, *, better: bool = True) -> None:
         """Add what the last pass has found, unless that makes it worse. Collective."""
         old = self.missing
-        self._least = min(self._least, self._least_singular_value())
+        self._spectrum.look(self.ksp)
         self.x.axpy(1.0, self.d)
         self._judge()
         if better and self.missing > max(old, 1.0):
@@ -146,48 +182,46 @@ class Refinement:
         """Estimate the error of each field; where that casts doubt, improve the solution, or measure it. Collective.
 
         One application of the preconditioner to the residual is an estimate, divided by the least singular value that
-        GMRES has seen. To measure the error is to solve for a residual of this size with a part at random, whatever
+        GMRES has seen. Other methods see none, and leave doubt. So does a field whose equations do not add up:
+        a residual that is small in each cell may be large beside what is left of their sum, which alone says how high
+        a pressure is. To measure the error is to solve for a residual of this size with a part at random, whatever
         the preconditioner is worth: a solution that the equations do not determine changes beyond measure.
         """
         if self.missing > 1.0 or not self.passes:
             return
-        doubtful = self._missed > FAR or not self.reason.startswith("CONVERGED")
+        seen = self.ksp.getType() in (*HESSENBERG, PETSc.KSP.Type.PREONLY)  # how good the preconditioner is
+        doubtful = not seen or self._missed > FAR or not self.reason.startswith("CONVERGED")
+        doubtful = doubtful or max(self.system.imbalance(self.x, self.r).values()) > BALANCED
         for _ in range(MOST_IMPROVEMENTS):
             self._precondition()
             steps, eta = self._relative(self.d), max(self.check.backward.values())
-            self.estimates = {f: e / self._least for f, e in steps.items()}
-            if max(self.estimates.values()) <= WELL_DETERMINED and not doubtful:
+            self.estimates = {f: e / self._spectrum.least for f, e in steps.items()}
+            if max(self.estimates.values()) <= DETERMINED and not doubtful:
                 return
             step = max(steps.values())
             final = eta <= LIMIT or self.ksp.getType() == PETSc.KSP.Type.PREONLY
-            if step <= WELL_DETERMINED or final:
+            if step <= DETERMINED or final:
                 found, doubtful = self._measured(), True
                 self.estimates = found or self.estimates
-                if found is not None and max(found.values()) <= DETERMINED:
+                if found is not None and max(found.values()) <= (ACCEPTED if final else DETERMINED):
                     return
                 if final or found is None:
                     break
                 step = max(found.values())
-            self._pass(min(max(MARGIN * WELL_DETERMINED / step, 1e-4), MARGIN))
+            self._pass(min(max(MARGIN * DETERMINED / step, 1e-4), MARGIN))
             self._take_step()
             if self.missing > 1.0 or self.iterations >= self.max_it:
                 break
         self.is_determined = False
-        wrong = {f: e for f, e in self.estimates.items() if not e <= DETERMINED}
+        wrong = {f: e for f, e in self.estimates.items() if not e <= ACCEPTED}
         self.notes += (
             "ill-conditioned: the residual is small, but says little of the error, which is estimated at "
             + ", ".join(f"{e:.0e} ({f})" for f, e in wrong.items())
-            + f" of the solution; at most {DETERMINED:g} counts as converged"
+            + f" of the solution; at most {ACCEPTED:g} counts as converged"
             if wrong
             else "the residual is small, but casts doubt on the solution, and its error could not be measured: the "
             "Krylov method failed on another right-hand side",
         )
-
-    def _least_singular_value(self) -> float:
-        """The least one of A M^-1 that GMRES has seen, at most 1; 1 for other methods. Local."""
-        if self.ksp.getType() != PETSc.KSP.Type.GMRES or not self.ksp.getIterationNumber():
-            return 1.0
-        return min(1.0, max(float(self.ksp.computeExtremeSingularValues()[1]), EPS))
 
     def _precondition(self) -> None:
         """D = M^-1 r. Collective."""
@@ -208,7 +242,7 @@ class Refinement:
         system = self.system
         random = {f: scattered(system, f) for f in system.layout.fields}
         there, sizes = system.norms(system.by_field(self.r), random)
-        parts = [v * (there[f] / (sizes[f] or 1.0)) for f, v in random.items()]
+        parts = [v * (NOISE * there[f] / (sizes[f] or 1.0)) for f, v in random.items()]
         kept, reason, found, rest = self.r.copy(), self.reason, self.d.duplicate(), self.r.duplicate()
         self.r.setArray(self.r.getArray() + np.concatenate(parts))
         found.set(0.0)

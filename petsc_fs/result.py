@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 from petsc_fs.system import FieldArrays
@@ -52,8 +52,11 @@ class Result:
     passes: tuple[int, ...]
     setup_seconds: float
     solve_seconds: float
-    solution: FieldArrays = field(repr=False)
+    solution: FieldArrays
     notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        return f"<Result {self.verdict}; {self.iterations} iterations ({self.reason})>"
 
     @property
     def verdict(self) -> str:

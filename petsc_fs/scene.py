@@ -25,6 +25,7 @@ from petsc_fs.csr import (
     real_numbers,
     singular_diagonal_blocks,
     whole_numbers,
+    with_ones,
 )
 from petsc_fs.errors import LayoutError, SceneError, UsageError
 from petsc_fs.fields import FIELD, FIELD_NAMES, in_order
@@ -126,6 +127,12 @@ class Scene:
     metadata: Metadata = field(default_factory=Metadata)
     rows: dict[str, tuple[int, int]] | None = None
 
+    def __repr__(self) -> str:
+        sizes = ", ".join(f"{f} {self.sizes[f]:,}" for f in self.fields)
+        entries = sum(block.data.size for block in self.blocks.values())
+        part = "" if self.rows is None else ", part of one rank"
+        return f"<Scene {self.metadata.model!r}, {self.dimension}D: {sizes}; {entries:,} entries{part}>"
+
     @property
     def fields(self) -> tuple[str, ...]:
         """Names of the fields present, in the order of the table."""
@@ -157,7 +164,8 @@ class Scene:
             matrix: (n, n), a sparse matrix of scipy, a dense array, or anything with `indptr`, `indices` and `data` of
                 compressed rows. Columns of a row come in any order; entries of the same place are added.
             rhs: (n,) right-hand side, or (n, 1).
-            fields: field name to the rows of its equations: numbers, a range, a slice or a mask.
+            fields: field name to the rows of its equations: numbers, a range, a slice or a mask. A number -1 stands for
+                an unknown that was eliminated, a fixed displacement for example: it becomes an equation x = 0.
             dimension: of the rock matrix.
             columns: field name to the columns of its unknowns, where they differ from the rows.
             order: of the numbers of vector fields: "cell" for all components of a cell before the next cell, or
@@ -193,7 +201,12 @@ class Scene:
             found = {f: _numbers(given[f], n, f"{f}: {what} numbers") for f in names}
             for f, ids in found.items():
                 bs = FIELD[f].block_size(dimension)
-                if orders[f] == "component" and ids.size % bs == 0:
+                if bs > 1 and ids.size % bs:
+                    raise LayoutError(
+                        f"{f}: {ids.size} {what}s, which is not a multiple of block size {bs} in {dimension}D; if "
+                        "fixed unknowns were eliminated, give -1 for their numbers, or keep them with 1 on the diagonal"
+                    )
+                if bs > 1 and orders[f] == "component":
                     found[f] = ids.reshape(bs, -1).T.ravel()
             return found
 
@@ -202,6 +215,16 @@ class Scene:
         for f in names:
             if row_ids[f].size != col_ids[f].size:
                 raise LayoutError(f"{f}: {row_ids[f].size} rows but {col_ids[f].size} columns; they must pair up")
+            absent = row_ids[f] == -1
+            if (absent != (col_ids[f] == -1)).any():
+                raise LayoutError(f"{f}: rows and columns must be -1 at the same places")
+            if absent.any():
+                for ids in (row_ids, col_ids):
+                    ids[f] = ids[f].copy()
+                    ids[f][absent] = np.arange(n, n + np.count_nonzero(absent))
+                n += np.count_nonzero(absent)
+        if n > b.size:
+            whole, b = with_ones(whole, n - b.size), np.append(b, np.zeros(n - b.size))
         _inverse(row_ids, n, "row")
         target = _inverse(col_ids, n, "column")
         blocks = {

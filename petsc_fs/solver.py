@@ -19,7 +19,7 @@ from petsc_fs import options as database
 from petsc_fs.errors import SceneError, SolveError, UsageError
 from petsc_fs.partition import Layout, chosen, partition
 from petsc_fs.petsc_errors import brief, translate
-from petsc_fs.refinement import PETSC_ATOL, Refinement
+from petsc_fs.refinement import PETSC_ATOL, Refinement, Spectrum
 from petsc_fs.result import Result
 from petsc_fs.scene import Scene
 from petsc_fs.singular import attach, describe, null_vectors
@@ -33,10 +33,9 @@ class Solver:
 
     Where the database chooses no preconditioner (`-pc_type`), the default options file for the scene's fields does.
 
-    Options:
-        -petsc_fs_partition, -petsc_fs_ordering: see `petsc_fs.partition.partition`.
-        -petsc_fs_retry FILE|none: options file of a second solve, where the first has not converged; its options have
-            the prefix retry_. Default none.
+    Options beside those of `petsc_fs.partition.chosen`:
+        -petsc_fs_retry <none> (an options file, none): a second solve by this file, where the first has not converged.
+        -retry_*: what -petsc_fs_retry's file has, with this prefix.
 
     Attributes:
         rtol: relative tolerance, -ksp_rtol.
@@ -101,6 +100,10 @@ class Solver:
         self._finalizer.atexit = False  # where nothing collective may depend on what is alive on a rank
         self._built_seconds = time.perf_counter() - started
 
+    def __repr__(self) -> str:
+        default = self._chosen.file.name if self._chosen.file else "the smallest solver"
+        return f"<Solver by {default if self._chosen.values else 'options of the database'} for {self.layout!r}>"
+
     @property
     def rebuilds(self) -> int:
         """How often matrices of blocks were made anew because their pattern had changed."""
@@ -151,8 +154,7 @@ class Solver:
             ksp.destroy()
             raise UsageError(f"PETSc refuses an option: {brief(e)}") from e
         ksp.setConvergenceHistory(reset=True)
-        if ksp.getType() == PETSc.KSP.Type.GMRES:
-            ksp.setComputeSingularValues(True)  # of what it projects anyway
+        Spectrum(ksp)
         return ksp
 
     def update(self, scene: Scene | None) -> None:

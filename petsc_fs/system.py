@@ -369,6 +369,24 @@ class System:
             )
         return Check(residuals, sizes, rights, r.norm() / (self.b.norm() or 1.0))
 
+    def imbalance(self, x: PETSc.Vec, r: PETSc.Vec) -> dict[str, float]:
+        """By how much the sum of the equations of each field, in which fluxes between cells cancel, misses. Collective.
+
+        With w one for the first component of each cell, 1/2 for the second and 1/3 for the third, what is returned is
+        |w^T r_f| / (|w^T A_f| |x| + |w^T b_f|), the backward error of w^T A_f x = w^T b_f.
+        """
+        values, left, rhs = self.by_field(x), self.by_field(r), self.by_field(self.b)
+        sums = np.zeros((len(self.layout.fields), 3))
+        for k, f in enumerate(self.layout.fields):
+            weights = np.tile(1.0 / np.arange(1, self.layout.block_size(f) + 1), self.layout.own_cells(f).size)
+            sums[k] = weights @ left[f], 0.0, weights @ rhs[f]
+            for (row, column), block in self.blocks.items():
+                if row == f:
+                    sums[k, 1] += np.abs(nest.multiply_transposed(block, weights)) @ np.abs(values[column])
+        missing, terms, rights = np.abs(self.layout.comm.allreduce(sums)).T
+        found = missing / np.where(terms + rights > 0, terms + rights, 1.0)
+        return dict(zip(self.layout.fields, found.tolist(), strict=True))
+
     def least_sizes(self, check: Check, tolerance: float) -> dict[str, float]:
         """Per field the size below which it changes no equation by more than a tolerance of its terms. Local."""
         limits = {

@@ -1,6 +1,7 @@
 """The solver on real scenes: numpy confirms every verdict, whatever the options, right-hand sides, earlier matrices."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from common import (
     NAMES,
     SCENES,
+    Arrays,
     block_of,
     comm,
     confirm,
@@ -19,6 +21,7 @@ from common import (
     noisy,
     scaled,
     thinned,
+    times,
     unequal,
     verified,
     with_block,
@@ -33,6 +36,7 @@ from petsc_fs.fields import FIELD
 from petsc_fs.partition import Layout
 from petsc_fs.scene import CSR, Scene
 from petsc_fs.solver import Solver
+from petsc_fs.tools import reference, stress_cases
 
 pytestmark = pytest.mark.mpi
 MECHANICS = "qr_fieldsplit_1_fieldsplit_mechanics_"
@@ -143,6 +147,40 @@ def test_whatever_the_krylov_method_the_verdict_is_that_of_the_system(database, 
     for _ in range(2):
         result = verified(scene, solver)
     assert result.converged or odd in ("preonly", "no norm"), result  # the latter has no iterations left for the error
+
+
+@cache
+def scattered(seed: int) -> tuple[Scene, Arrays]:
+    """Pressures counted in units that differ from cell to cell by up to 16 decades, and a solution without order."""
+    random = np.random.default_rng(seed)
+    scene = load("model1")
+    units = np.exp2(np.round(random.uniform(-8, 8, scene.sizes["mass"]) * np.log2(10)))
+    scene = stress_cases.scaled(scene, columns={"mass": units})
+    x = {f: random.standard_normal(n) for f, n in scene.sizes.items()}
+    size = {"intf_force": 1e-5, "momentum": 1e3, "intf_flow": 1e-7, "mass": units}
+    x = {f: v * size.get(f, 1.0) for f, v in x.items()}
+    rhs = {f: np.zeros(n) for f, n in scene.sizes.items()}
+    for (r, c), block in scene.blocks.items():
+        rhs[r] += times(block, x[c])
+    scene = replace(scene, rhs=rhs)
+    return scene, reference.solve(scene, "direct").solution
+
+
+BESIDES_GMRES = ("fgmres", "lgmres", "dgmres", "pgmres", "bcgs", "tfqmr", "cgs", "gcr")
+
+
+@serial
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("file", "ksp_type"),
+    [(f, "gmres") for f in ("", "_fast", "_left", "_gamg", "_direct")] + [("_fast", k) for k in BESIDES_GMRES],
+)
+def test_what_the_equations_do_not_determine_is_no_solution(database, file, ksp_type, seed):
+    scene, truth = scattered(seed)
+    database(f"contact_poromechanics{file}.opts", ksp_type=ksp_type)
+    result = verified(scene, Solver(scene))
+    error = max(np.linalg.norm(result.solution[f] - v) / np.linalg.norm(v) for f, v in truth.items())
+    assert error <= 1e-2 or not result.converged, result
 
 
 def test_a_factorisation_alone_is_enough(database):

@@ -196,6 +196,24 @@ def test_what_a_check_says_is_so():
     assert all(check.terms[f] >= system.check(x, r).terms[f] * (1 - 1e-12) for f in scene.fields)
 
 
+@pytest.mark.parametrize("name", ["biot", "contact", "model3"])
+def test_the_imbalance_is_the_backward_error_of_the_sum_of_equations(name):
+    scene, rng = load(name), np.random.default_rng(4)
+    system = system_of(scene)
+    x, r = system.b.duplicate(), system.b.duplicate()
+    values = {f: rng.standard_normal(n) for f, n in scene.sizes.items()}
+    x.setArray(np.concatenate([system.to_layout(f, v) for f, v in values.items()]))
+    system.check(x, r)
+    found = system.imbalance(x, r)
+    for f, v in scene.rhs.items():
+        weights = np.tile([1.0, 1 / 2, 1 / 3][: scene.block_size(f)], v.size // scene.block_size(f))
+        rows = {c: weights @ block_of(scene, f, c) for c in scene.fields}
+        rhs = np.ldexp(weights @ v, system.rhs_scale)
+        missing = rhs - sum(row @ values[c] for c, row in rows.items())
+        terms = abs(rhs) + sum(np.abs(row) @ np.abs(values[c]) for c, row in rows.items())
+        assert found[f] == pytest.approx(abs(missing) / terms, rel=1e-3)  # fluxes cancel
+
+
 def test_excess_is_the_worst_of_what_is_missed_but_for_rounding():
     check = Check({"a": 1e-6, "b": 1e-12}, {"a": 1.0, "b": 1e-8}, {"a": 0.5, "b": 0.0}, 1e-6)
     assert check.relative == pytest.approx(2e-6)

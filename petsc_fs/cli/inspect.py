@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petsc_fs import options
-from petsc_fs.cli.tables import contents_table, scene_table, table
+from petsc_fs.cli.tables import contents_table, scene_table, table, wrapped
 from petsc_fs.errors import UsageError, together
+from petsc_fs.fields import learn_aliases
 from petsc_fs.io import hdf5, sequence
 from petsc_fs.io.bundled import check_targets, find_scene
 from petsc_fs.io.files import write_text
@@ -27,6 +28,9 @@ SPREAD = ("cells", "least", "median", "greatest", "at (m)")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `command`."""
     parser.add_argument("scene", metavar="SCENE", help="file, or name of a bundled one such as model1.h5")
+    parser.add_argument(
+        "--fields", type=learn_aliases, metavar="NAME=FIELD,...", help="other names of fields there: u=momentum,p=mass"
+    )
     parser.add_argument("--step", type=int, metavar="K", help="of a sequence, show this step; from 0")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the block structure (.png, .svg, .pdf)")
     parser.add_argument(
@@ -110,4 +114,4 @@ def contraction_text(found: Contraction) -> str:
     if found.violations:
         words = [(VIOLATIONS[name], *spread(values)) for name, values in found.violations.items()]
         parts += ["", "against its assumptions", table(["", *SPREAD], words)]
-    return "\n".join([*parts, *(f"- {note}" for note in found.notes)])
+    return "\n".join([*parts, wrapped(f"- {note}" for note in found.notes)])

@@ -8,6 +8,7 @@ import io
 import locale
 import os
 import sys
+import textwrap
 import time
 import traceback
 from collections.abc import Sequence
@@ -15,9 +16,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from petsc_fs import options
+from petsc_fs import missing, options
 from petsc_fs.errors import PetscFsError, UsageError, together
-from petsc_fs.io.bundled import bundled, find_scene
+from petsc_fs.fields import learn_aliases
+from petsc_fs.io.bundled import bundled, find_scene, versions
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -51,9 +53,10 @@ A scene is one such system in an HDF5 file. Try, with the scenes that come along
 
   petsc-fs inspect model2.h5
   petsc-fs solve model2.h5
-  mpiexec -n 2 petsc-fs solve model3.h5 -options_file contact_poromechanics.opts -ksp_monitor
+  mpiexec -n 2 petsc-fs solve model3.h5 -ksp_rtol 1e-8 -ksp_monitor
 
-Options with two dashes are this program's; those with one dash are PETSc's and are passed on."""
+Options with two dashes are this program's; those with one dash are PETSc's and are passed on.
+petsc-fs COMMAND --help tells more, and of solve also the options of the preconditioners."""
 
 LINT_EPILOG = """\
 The solver is set up on the scene but does not run. Found are: lines PETSc would stop at, options that
@@ -64,13 +67,28 @@ CONVERT_EPILOG = """\
 The folder holds matrix.petsc (MatLoad), rhs.petsc and, if known, reference.petsc (VecLoad), one
 fields/NAME.petsc per field (ISLoad: the rows and columns of the field), and scene.h5 with what PETSc's
 format has no place for (cell data, material, units), without which the way back gives less and needs
---dimension."""
+--dimension.
+
+A matrix alone is in Matrix Market's format or .npz (which need scipy), .npy, hypre's IJ files (all that
+have the prefix SOURCE), or PETSc's binary format; so is the right-hand side, or it is a text of numbers:
+
+  petsc-fs convert A.mtx mine.h5 --rhs b.mtx --rows momentum=0:100,mass=100:150 --dimension 2
+  petsc-fs convert A.npz mine.h5 --rhs b.npy --rows momentum=@u.txt,mass=@p.txt --dimension 3
+  petsc-fs convert IJ.out.A mine.h5 --rhs IJ.out.b --dofmap dofmap.out --rows momentum=0:3,mass=3 --dimension 3
+
+Rows are slices as in Python, single numbers, or @FILE with numbers (from 0; -1 for an unknown that was
+eliminated, which becomes an equation x = 0); more than one for a field follow each other:
+mass=100:150,160:170. With --dofmap they are labels."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code. Collective on all ranks of an MPI run."""
-    from mpi4py import MPI
-
+    try:
+        import petsc4py  # noqa: F401
+        from mpi4py import MPI
+    except (ImportError, RuntimeError) as e:  # the latter from a wheel of mpi4py that finds no MPI
+        print(f"petsc-fs: {missing(e)}", file=sys.stderr)
+        return UsageError.exit_code
     comm = MPI.COMM_WORLD
     locale.setlocale(locale.LC_NUMERIC, "C")  # or PETSc reads no decimal points
     for stream in (sys.stdout, sys.stderr):
@@ -88,6 +106,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise UsageError(
                 f"{petsc[0]}: PETSc options go with {' and '.join(TAKES_PETSC)}; options of petsc-fs have two dashes"
             )
+        _explain(petsc, comm)
         code = int(args.run(args, petsc, comm))
         if args.summary is not None:
             from petsc_fs.cli.tables import run_table
@@ -128,6 +147,8 @@ def split_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
         else:
             (own if option not in options.TAKE_FILES and _is_scene(word) else petsc).append(word)
             option = ""
+    if "-help" in petsc and len(own) < 2:  # no scene, of whose solver PETSc would tell
+        own.append("--help")
     return own, petsc
 
 
@@ -140,6 +161,14 @@ def _is_scene(word: str) -> bool:
             return os.path.isfile(word) and file.read(4) == b"\x89HDF"
     except (OSError, ValueError):
         return False
+
+
+def _explain(petsc: Sequence[str], comm: MPI.Intracomm) -> None:
+    """With -help, show the options of this package before PETSc shows its own."""
+    if "-help" in petsc and comm.rank == 0:
+        from petsc_fs.cli import manual
+
+        print(manual.text(), flush=True)
 
 
 def _fail(comm: MPI.Intracomm, message: str, code: int) -> None:
@@ -166,21 +195,46 @@ def _describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}{where}"
 
 
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """Paragraphs filled to the width of the terminal, and lines that begin with a space as they are."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        parts: list[str] = []
+        for line in text.splitlines():
+            if parts and line and parts[-1] and not line.startswith(" ") and not parts[-1].startswith(" "):
+                parts[-1] += f" {line}"
+            else:
+                parts.append(line)
+        return "\n".join(
+            textwrap.fill(
+                part, width, subsequent_indent="      " if part.startswith(" ") else "", break_on_hyphens=False
+            )
+            for part in parts
+        )
+
+
 class _Parser(argparse.ArgumentParser):
-    """One line on a wrong call, as for any other error."""
+    """One line on a wrong call, as for any other error; help with the options of this package."""
+
+    def format_help(self) -> str:
+        found = super().format_help()
+        if self.prog.split()[-1] not in TAKES_PETSC:
+            return found
+        from petsc_fs.cli import manual
+
+        return f"{found}\n{manual.text()}\n"
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message}; see {self.prog} --help")
 
 
 def _parser(command: list[str]) -> argparse.ArgumentParser:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = _Parser(prog="petsc-fs", description=DESCRIPTION, formatter_class=raw)
+    parser = _Parser(prog="petsc-fs", description=DESCRIPTION, formatter_class=_Help)
     parser.set_defaults(summary=None, close=None)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def add(name: str, summary: str, run: Any, **more: Any) -> argparse.ArgumentParser:
-        sub = commands.add_parser(name, help=summary, description=summary, formatter_class=raw, **more)
+        sub = commands.add_parser(name, help=summary, description=summary, formatter_class=_Help, **more)
         sub.set_defaults(run=run)
         return sub
 
@@ -198,14 +252,41 @@ def _parser(command: list[str]) -> argparse.ArgumentParser:
     lint.add_argument("file", metavar="FILE", help="options file, or the name of a shipped one")
     lint.add_argument("scene", metavar="SCENE", nargs="?", help="scene it is for; default a bundled one that fits")
 
-    convert = add("convert", "turn a scene into PETSc's binary format, or back", _convert, epilog=CONVERT_EPILOG)
-    convert.add_argument("source", metavar="SOURCE", help="scene or sequence (.h5), or folder in PETSc's format")
+    convert = add(
+        "convert",
+        "turn a matrix into a scene, a scene into PETSc's binary format, or back",
+        _convert,
+        epilog=CONVERT_EPILOG,
+    )
+    convert.add_argument(
+        "source", metavar="SOURCE", help="scene or sequence (.h5), folder in PETSc's format, or matrix"
+    )
     convert.add_argument("target", metavar="TARGET", help="folder to write, or scene (.h5)")
     convert.add_argument("--step", type=int, metavar="K", help="of a sequence, write this step as a scene; from 0")
+    convert.add_argument("--dimension", type=int, choices=(2, 3), help="of the rock, where nothing in SOURCE tells it")
+    convert.add_argument("--rows", metavar="FIELD=ROWS,...", help="of a matrix: which rows belong to which field")
+    convert.add_argument("--rhs", type=Path, metavar="FILE", help="of a matrix: the right-hand side")
     convert.add_argument(
-        "--dimension", type=int, choices=(2, 3), help="of the rock, where SOURCE is a folder without scene.h5"
+        "--dofmap", type=Path, metavar="FILE", help="of a matrix: labels of the rows, as hypre has them"
     )
+    convert.add_argument(
+        "--order", choices=("cell", "component"), default="cell",
+        help="of a matrix: vector fields list all components of a cell before the next cell, or the other way round",
+    )  # fmt: skip
+    convert.add_argument(
+        "--fields", type=learn_aliases, metavar="NAME=FIELD,...", help="other names of fields there: u=momentum,p=mass"
+    )
+    parser.add_argument("--version", action=_Version, nargs=0, help="show versions of all that takes part")
     return parser
+
+
+class _Version(argparse.Action):
+    """Print the versions of all that takes part, and end. Collective."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        options.Given.of([]).start()
+        print("\n".join(f"{name:12}{version}" for name, version in versions().items()))
+        parser.exit()
 
 
 def _options(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
@@ -242,18 +323,25 @@ def _convert(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) ->
     if comm.size > 1:
         raise UsageError("convert runs on one rank; start it without mpiexec")
     options.Given.of([]).start()
-    from petsc_fs.io import petsc_binary
+    from petsc_fs.io import hdf5, matrices, petsc_binary, sequence
 
     source, target = Path(args.source), Path(args.target)
-    if args.step is not None:
-        from petsc_fs.io import hdf5, sequence
-
+    if args.rows is None and (args.rhs or args.dofmap):
+        raise UsageError("--rhs and --dofmap are about a matrix, which needs --rows FIELD=ROWS,... too")
+    if args.rows is not None:
+        if args.rhs is None or args.dimension is None:
+            raise UsageError("--rows: a matrix needs --rhs FILE and --dimension 2 or 3 besides")
+        more = {"dimension": args.dimension, "order": args.order, "dofmap": args.dofmap}
+        written = matrices.to_scene(source, target, rhs=args.rhs, rows=args.rows, **more)
+    elif source.is_dir() and args.step is None:
+        written = petsc_binary.to_scene(source, target, dimension=args.dimension)
+    elif args.step is None and target.suffix != ".h5":
+        written = petsc_binary.from_scene(find_scene(args.source), target)
+    else:
         if target.suffix != ".h5":
             raise UsageError(f"{target}: a step becomes a scene, whose name ends in .h5")
-        written = [hdf5.write(sequence.read(find_scene(args.source), args.step), target)]
-    elif source.is_dir():
-        written = petsc_binary.to_scene(source, target, dimension=args.dimension)
-    else:
-        written = petsc_binary.from_scene(find_scene(args.source), target)
+        path = find_scene(args.source)
+        scene = hdf5.read(path) if args.step is None else sequence.read(path, args.step)
+        written = [hdf5.write(scene, target)]
     print(f"written: {', '.join(str(p) for p in written)}")
     return 0

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from petsc_fs import options
 from petsc_fs.errors import PetscFsError, UsageError, together
+from petsc_fs.fields import learn_aliases
 from petsc_fs.io import hdf5, sequence
 from petsc_fs.io.bundled import check_targets, find_scene, versions
 from petsc_fs.io.files import write_text
@@ -33,13 +34,12 @@ TOTALS = ("iterations", "read_seconds", "setup_seconds", "solve_seconds")
 
 EPILOG = """\
 PETSc options follow the scene, for example
-  -options_file FILE     an options file of yours, or the name of a shipped one
-  -ksp_rtol 1e-6         relative tolerance      -ksp_monitor   residual at each iteration
-  -ksp_view              the solver tree         -log_view      where time goes
-  -petsc_fs_retry FILE   options file for a second solve, where the first one fails
-  -petsc_fs_partition rcb    which rank gets which cells: auto, rcb, ptscotch or contiguous
-  -petsc_fs_ordering morton  order of the cells of a rank: auto, natural (that of the file), or along a curve
-  -petsc_fs_allow_unused my_*   names of options that may do nothing
+  -options_file FILE   an options file of yours, or the name of a shipped one
+  -ksp_rtol 1e-6       relative tolerance
+  -ksp_monitor         residual at each iteration
+  -ksp_view            the solver tree
+  -log_view            where time goes
+  -help                what PETSc knows of the solver at hand
 
 exit codes: 0 converged, by the residual of the system in the file; 1 not converged, or the solve
 failed; 2 wrong call or option; 3 a scene that cannot be read or does not fit together"""
@@ -49,6 +49,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `command`."""
     parser.epilog = EPILOG
     parser.add_argument("scene", metavar="SCENE", help="file, or name of a bundled one such as model1.h5")
+    parser.add_argument(
+        "--fields", type=learn_aliases, metavar="NAME=FIELD,...", help="other names of fields there: u=momentum,p=mass"
+    )
     parser.add_argument("--report", type=Path, metavar="FILE.json", help="write what was done and measured")
     parser.add_argument("--save", type=Path, metavar="FILE.h5", help="write the solution, in the scene's numbering")
     parser.add_argument("--steps", metavar="A:B", help="of a sequence, solve these only; from 0, B excluded")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -42,8 +43,10 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[object]], left: str =
 
 
 def wrapped(lines: Iterable[str]) -> str:
-    """Lines, each broken where it is too long."""
-    return "\n".join(textwrap.fill(line, WIDTH, subsequent_indent="  ", break_on_hyphens=False) for line in lines)
+    """Lines, each broken where it is too long, but not between a number and its unit."""
+    kept = (re.sub(r"(\d) (?=[KMG]?i?B\b|s\b)", "\\1\xa0", line) for line in lines)
+    filled = (textwrap.fill(line, WIDTH, subsequent_indent="  ", break_on_hyphens=False) for line in kept)
+    return "\n".join(filled).replace("\xa0", " ")
 
 
 def solve_table(report: dict[str, Any]) -> str:

@@ -73,9 +73,11 @@ def _of_the_system(folder: Path) -> bool:
 
 
 def versions() -> dict[str, str]:
-    """Version of everything that takes part in a solve."""
+    """Version of everything that takes part in a solve; whether PETSc has hypre."""
     import mpi4py
     import numpy as np
+    import petsc4py
+    from mpi4py import MPI
     from petsc4py import PETSc
 
     from petsc_fs.io import hdf5
@@ -83,7 +85,10 @@ def versions() -> dict[str, str]:
     return {
         **hdf5.versions(),
         "petsc": ".".join(map(str, PETSc.Sys.getVersion())),
+        "petsc4py": petsc4py.__version__,
+        "hypre": "yes" if PETSc.Sys.hasExternalPackage("hypre") else "no",
+        "mpi": " ".join(MPI.Get_library_version().strip("\0").split(",")[0].splitlines()[0].split()),
+        "mpi4py": mpi4py.__version__,
         "python": platform.python_version(),
         "numpy": np.__version__,
-        "mpi4py": mpi4py.__version__,
     }

@@ -31,7 +31,7 @@ import numpy as np
 from petsc_fs import __version__
 from petsc_fs.csr import whole_numbers
 from petsc_fs.errors import LayoutError, SceneError
-from petsc_fs.fields import FIELD, FIELD_NAMES, in_order
+from petsc_fs.fields import FIELD, FIELD_NAMES, field_of, in_order
 from petsc_fs.io.files import check_regular, complete
 from petsc_fs.scene import CSR, Integers, Material, Metadata, Scene, check_order
 
@@ -202,16 +202,17 @@ def read_group(
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if rows is None and promised > memory:
         raise SceneError(f"takes {promised / 2**30:.0f} GiB, and this machine has {memory / 2**30:.0f} GiB")
+    fields = field_groups(group)
     for f, size in sizes.items():  # before anything is made of the sizes
-        if "rhs" not in group["fields"][f]:
+        if "rhs" not in fields[f]:
             raise LayoutError(f"{f}: rhs is missing")
-        if (rhs := group["fields"][f]["rhs"]).size != size:
+        if (rhs := fields[f]["rhs"]).size != size:
             raise LayoutError(f"{f}: rhs has shape {rhs.shape}, expected {(size,)}")
     chosen = {f: (0, n) for f, n in sizes.items()} if rows is None else rows(dimension, sizes)
     ranges = {f: (int(a), int(b)) for f, (a, b) in chosen.items()}
     arrays: dict[str, dict[str, Any]] = {what: {} for what in (*PER_ROW, *PER_CELL)}
     for f, size in sizes.items():
-        datasets, bs = group["fields"][f], FIELD[f].block_size(dimension)
+        datasets, bs = fields[f], FIELD[f].block_size(dimension)
         for what, found in arrays.items():
             unit = bs if what in PER_CELL else 1
             if what in datasets:
@@ -219,8 +220,9 @@ def read_group(
                 part = slice(*(n // unit for n in ranges[f]))
                 found[f] = _read_array(datasets[what], f"{f}: {what}", shape, part, what not in INTEGERS)
     blocks: dict[tuple[str, str], CSR] = {}
-    for r, row in group["blocks"].items():
-        for c, block in row.items():
+    for row_name, row in group["blocks"].items():
+        for column_name, block in row.items():
+            r, c = field_of(row_name), field_of(column_name)
             if r not in sizes or c not in sizes:
                 raise LayoutError(f"block ({r}, {c}): the scene has no field {r if r not in sizes else c!r}")
             read_rows = partial(_read_block, block, f"block ({r}, {c})", (sizes[r], sizes[c]))
@@ -261,7 +263,7 @@ def open_file(path: Path) -> Iterator[h5py.File]:
         ):
             if sign in str(e):
                 raise SceneError(f"{path}: {meaning}") from e
-        raise SceneError(f"{path}: not an HDF5 file, so not a scene; make one with petsc-fs export") from e
+        raise SceneError(f"{path}: not an HDF5 file, so not a scene; make one with petsc-fs export or convert") from e
     with file, explained(path):
         yield file
 
@@ -351,9 +353,9 @@ def read_header(file: h5py.Group) -> tuple[int, dict[str, int]]:
         if word.rstrip("\0 ") not in file["fields"]:
             raise SceneError(f"the scene is incomplete: field {word!r} has no group")
     sizes: dict[str, int] = {}
-    for name, group in file["fields"].items():
+    for name, group in field_groups(file).items():
         if name not in FIELD:
-            raise LayoutError(f"unknown field {name!r}; fields are {', '.join(FIELD_NAMES)}")
+            raise LayoutError(f"unknown field {name!r}; fields are {', '.join(FIELD_NAMES)}; see --fields")
         sizes[name], bs = attribute(group, "size", int), attribute(group, "block_size", int)
         if bs != FIELD[name].block_size(dimension):
             raise LayoutError(
@@ -362,6 +364,18 @@ def read_header(file: h5py.Group) -> tuple[int, dict[str, int]]:
         if sizes[name] < 0 or sizes[name] % bs:
             raise LayoutError(f"{name}: {sizes[name]} rows is not a multiple of block size {bs}")
     return dimension, {name: sizes[name] for name in in_order(sizes)}
+
+
+def field_groups(file: h5py.Group) -> dict[str, h5py.Group]:
+    """Group of each field of a scene.
+
+    Raises:
+        LayoutError: two names in the file stand for one.
+    """
+    groups = {field_of(name): group for name, group in file["fields"].items()}
+    if len(groups) != len(file["fields"]):
+        raise LayoutError(f"two of {', '.join(file['fields'])} are the same field by what --fields says")
+    return groups
 
 
 def check_storage(group: h5py.Group, depth: int = 3) -> int:

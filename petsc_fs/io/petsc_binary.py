@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petsc_fs.errors import SceneError, UsageError
-from petsc_fs.fields import FIELD_NAMES, MECHANICS
+from petsc_fs.fields import FIELD_NAMES, MECHANICS, field_of, in_order
 from petsc_fs.io import hdf5
 from petsc_fs.io.files import check_regular, complete
 from petsc_fs.scene import CSR, Integers, Scene
@@ -118,12 +118,12 @@ def to_scene(folder: Path, target: Path, *, dimension: int | None = None) -> lis
         SceneError: a file is missing or not PETSc's, or the parts do not fit together.
         UsageError: the dimension is not known, or the target cannot be written.
     """
-    names = [name for name in FIELD_NAMES if (folder / FIELDS / f"{name}.petsc").exists()]
-    if not names:
+    files = {field_of(file.stem): file for file in sorted((folder / FIELDS).glob("*.petsc"))}
+    if not (present := in_order(files)):
         raise SceneError(f"{folder}: no {FIELDS}/NAME.petsc there; fields are {', '.join(FIELD_NAMES)}")
-    matrix, n, columns = _File(folder / MATRIX, "matrix").matrix()
-    rhs = _File(folder / RHS, "vector").vector()
-    rows = {name: _File(folder / FIELDS / f"{name}.petsc", "index set").index_set() for name in names}
+    matrix, n, columns = File(folder / MATRIX, "matrix").matrix()
+    rhs = File(folder / RHS, "vector").vector()
+    rows = {name: File(files[name], "index set").index_set() for name in present}
     if n != columns or n != rhs.size:
         raise SceneError(f"{folder}: the matrix is {n} x {columns}, the right-hand side has {rhs.size} rows")
     known: dict[str, Any] = {}
@@ -138,14 +138,19 @@ def to_scene(folder: Path, target: Path, *, dimension: int | None = None) -> lis
         raise UsageError(f"{folder}: no {REST} there to tell the dimension; say --dimension 2 or 3")
     scene = Scene.from_matrix(matrix, rhs, rows, dimension=dimension, **known)
     if (folder / REFERENCE).exists():
-        solution = _File(folder / REFERENCE, "vector").vector()
+        solution = File(folder / REFERENCE, "vector").vector()
         if solution.size != n:
             raise SceneError(f"{folder / REFERENCE}: has {solution.size} rows, the matrix has {n}")
-        scene.reference = {name: solution[rows[name]] for name in names}
+        scene.reference = {name: solution[rows[name]] for name in present}
     return [hdf5.write(scene, target)]
 
 
-class _File:
+def is_petsc(head: bytes) -> bool:
+    """Whether a file that begins so has a matrix, vector or index set in PETSc's format."""
+    return any(head.startswith(np.array(number, kind).tobytes()) for number in KINDS.values() for kind in INTEGERS)
+
+
+class File:
     """A file with one object; what it announces is compared with its size before anything is made of it."""
 
     def __init__(self, path: Path, kind: str) -> None:

@@ -273,7 +273,7 @@ def _groups(file: h5py.File) -> list[h5py.Group]:
 def _step(group: h5py.Group, index: int) -> Step:
     dimension, sizes = hdf5.read_header(group)
     meta = hdf5.read_metadata(group)
-    states = group["fields/contact"].get("contact_state") if "contact" in sizes else None
+    states = hdf5.field_groups(group)["contact"].get("contact_state") if "contact" in sizes else None
     return Step(
         index=index,
         time_step_index=meta.time_step_index,

@@ -12,7 +12,7 @@ class Assembled(WrapperPC):
     """An inner PC on the operator as one AIJ, of which a copy is made if it is a MatNest: direct solvers need it.
 
     Options, with the prefix of this PC:
-        -assembled_pc_type, ...: the inner PC.
+        -assembled_*: of the inner PC.
     """
 
     prefix = "assembled_"

@@ -33,8 +33,9 @@ class ComponentSweep(BasePC):
     The operator is an AIJ with block size D, or a MatNest of such ones, which is not copied as a whole.
 
     Options, with the prefix of this PC:
-        -component_order forward|backward|none: see above.
-        -component_pc_type, ...: the inner PCs, the same for all components.
+        -component_order <forward> (forward, backward, none): from the first component to the last, the other
+            way, or without couplings between them (block Jacobi).
+        -component_*: of the inner PCs, the same for all components.
     """
 
     order = ORDERS[0]

@@ -36,12 +36,14 @@ class ContactTransform(WrapperPC):
     The operator is a MatNest with a named diagonal block per field, see `petsc_fs.nest`.
 
     Options, with the prefix of this PC:
-        -qr_side right|left|none: the transformation.
-        -qr_contact contact, -qr_interface intf_force: names of fields 1 and 2.
-        -qr_mechanics intf_force,momentum: names of the fields that become one; those that are not there are left out.
-        -qr_mechanics_mat_type aij|hypre|nest: storage of its block; hypre saves PCHYPRE its own copy; nest makes no
-            copy, for a `ComponentSweep`.
-        -qr_pc_type, ...: the inner PC, whose fields are contact, mechanics, and the others in their order.
+        -qr_side <right> (right, left, none): the transformation.
+        -qr_contact <contact>: name of field 1.
+        -qr_interface <intf_force>: name of field 2.
+        -qr_mechanics <intf_force,momentum>: names of the fields that become one; those that are not there are left
+            out. Where -qr_interface is given, its field takes the place of intf_force.
+        -qr_mechanics_mat_type <aij> (aij, hypre, nest): storage of the block of mechanics; hypre saves PCHYPRE its own
+            copy; nest makes no copy, for a `ComponentSweep`.
+        -qr_*: of the inner PC, whose fields are contact, mechanics, and the others in their order.
     """
 
     prefix = "qr_"

@@ -24,15 +24,15 @@ class FixedStress(WrapperPC):
     The operator is a MatNest in which a diagonal block has the name of that field, or the block itself.
 
     Options, with the prefix of this PC:
-        -fs_field mass: name of the field.
-        -fs_type analytic: D_55 = base * ratio ** damping (paper, eq:fixed_stress_coefs), from the vectors
-            "fixed_stress_base" and "fixed_stress_ratio" (1 if it is missing) that are composed on the block; the
-            default where they are there. `petsc_fs.scene.Scene.fixed_stress_coefficients` has
-            the formulas. Where the matrix contradicts these values, see `checked`.
-        -fs_type algebraic: D_55 from the matrix alone, see `petsc_fs.pc.algebraic`; the operator must be the Schur
-            complement that PCFIELDSPLIT makes, which knows the blocks of mechanics.
-        -fs_damping t: the exponent; 1 is the paper's formula, the default 0.6 is what its published code uses.
-        -fs_pc_type, ...: the inner PC.
+        -fs_field <mass>: name of the field of pressure.
+        -fs_type <analytic with data, else algebraic> (analytic, algebraic): analytic is D_55 = base * ratio ** damping
+            (paper, eq:fixed_stress_coefs), from the vectors "fixed_stress_base" and "fixed_stress_ratio" (1 if it is
+            missing) that are composed on the block. `petsc_fs.scene.Scene.fixed_stress_coefficients` has the
+            formulas. Where the matrix contradicts these values, see `checked`. algebraic is D_55 from the matrix
+            alone, see `petsc_fs.pc.algebraic`; the operator must be the Schur complement that PCFIELDSPLIT makes,
+            which knows the blocks of mechanics.
+        -fs_damping <0.6>: the exponent; 1 is the paper's formula, 0.6 what its published code uses.
+        -fs_*: of the inner PC.
     """
 
     prefix = "fs_"

@@ -17,13 +17,15 @@ ALMOST = 10.0
 class EisenstatWalkerParameters:
     """Parameters with the names and, but for `rtol0` and `rtolmax`, the defaults of PETSc's `-snes_ksp_ew_...`.
 
-    Attributes:
-        rtol0: first term of each time step.
-        rtolmax: the largest term. Textbooks have 0.1 and more, which takes more Newton steps here: contact states
-            follow the direction of the update, and each step costs an assembly and a set-up (docs/newton.md).
-        gamma: factor.
-        alpha: exponent.
-        threshold: how large the safeguard has to be to act.
+    Each is an attribute and an option of its name.
+
+    Options:
+        -petsc_fs_ew_rtol0 <0.0001>: first term of each time step.
+        -petsc_fs_ew_rtolmax <0.0001>: the largest term. Textbooks have 0.1 and more, which takes more Newton steps
+            here: contact states follow the direction of the update, and each step costs an assembly and a set-up.
+        -petsc_fs_ew_gamma <1>: factor.
+        -petsc_fs_ew_alpha <1.61803>: exponent.
+        -petsc_fs_ew_threshold <0.1>: how large the safeguard has to be to act.
     """
 
     rtol0: float = 1e-4

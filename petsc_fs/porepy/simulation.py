@@ -56,11 +56,8 @@ Where the file has dictionaries named model_params and solver_params, as in Pore
 model and PorePy's nonlinear solver get these.
 
 PETSc options follow, for example
-  -options_file FILE     an options file of yours, or the name of a shipped one; default is the
-                         smallest solver for the model
-  -ksp_rtol 1e-6         relative tolerance
-  -petsc_fs_on_failure accept|retry|raise        what becomes of a solve that misses its tolerance
-  -petsc_fs_forcing fixed|eisenstat_walker       exact or inexact Newton
+  -options_file FILE   an options file of yours, or the name of a shipped one
+  -ksp_rtol 1e-6       relative tolerance
 
 Written to DIR: solves.jsonl, one record per linear solve as soon as its Newton step is done;
 contact_states.png; summary.json; and, if asked for, sequence.h5 and vtu/.

@@ -126,15 +126,14 @@ class FieldSplitSolver:
     run; -petsc_fs_allow_unused names those that may (see `petsc_fs.options`).
 
     Options beside those of `petsc_fs.solver.Solver`:
-        -petsc_fs_on_failure accept|retry|raise: what happens to a solve that misses its tolerance, with a warning
-            to the logger "petsc_fs". accept uses the update all the same, as the paper did, as long as the linear
-            residual is less than that of no update at all. It is the default: what Newton's method needs is a
+        -petsc_fs_on_failure <accept> (accept, retry, raise): what happens to a solve that misses its tolerance, with
+            a warning to the logger "petsc_fs". accept uses the update all the same, as the paper did, as long as the
+            linear residual is less than that of no update at all. It is the default: what Newton's method needs is a
             smaller residual, whether it got there it sees for itself, and a second solve by stronger means may not
             fit into memory. retry is -petsc_fs_retry retry.opts, and raises if that fails too.
-        -petsc_fs_forcing fixed|eisenstat_walker: solve to -ksp_rtol, or each system only as far as Newton makes use
-            of it, but never further than to -ksp_rtol; see `petsc_fs.porepy.forcing.EisenstatWalker`. Residuals are
-            measured as Newton does, by the model's `compute_residual_norm`.
-        -petsc_fs_ew_rtol0, _rtolmax, _gamma, _alpha, _threshold: see
+        -petsc_fs_forcing <fixed> (fixed, eisenstat_walker): solve to -ksp_rtol, or each system only as far as Newton
+            makes use of it, but never further than to -ksp_rtol; see `petsc_fs.porepy.forcing.EisenstatWalker`.
+            Residuals are measured as Newton does, by the model's `compute_residual_norm`. Its parameters are those of
             `petsc_fs.porepy.forcing.EisenstatWalkerParameters`.
 
     Attributes:

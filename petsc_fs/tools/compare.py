@@ -15,6 +15,7 @@ import os
 import re
 import signal
 import sys
+import textwrap
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -222,7 +223,7 @@ def summary(found: Comparison, everything: Sequence[Point]) -> list[list[object]
 
 SUMMARY = ("scene", "ranks", "error ≤", *SECONDS.values())
 MEDIANS = "file;ranks;tolerance;iterations;true residual;forward error;set-up (s);solve (s);".split(";")
-RATIOS = "scene;ranks;file;iterations;set-up, s;solve, s;set-up ratio;solve ratio;ratio;MiB".split(";")
+RATIOS = "scene;ranks;file;Krylov;set-up, s;solve, s;set-up ratio;solve ratio;ratio;MiB".split(";")
 FAILURES = "scene;file;ranks;outcome;runs;said".split(";")
 
 
@@ -390,13 +391,16 @@ EPILOG = """\
 Scenes come first. Each combination of scene, options file and number of ranks runs in processes of its own; one that
 crashes, hangs or diverges is shown as such. Ctrl-C ends measuring; what was measured is written. --out gets
 compare.html, which needs no other file and no network, compare.json and compare.csv with all numbers, and pictures.
-Reference solutions are kept in --out and used again. An options file may be followed by further options, in quotes.
+Reference solutions are kept in --out and used again; --again draws what was measured anew.
+An options file may be followed by further options, in quotes.
 Single-dash options are PETSc's and go to every run (-n RANKS is the exception).
 
   petsc-fs compare model1.h5 model2.h5 --repeat 3 --out comparison
-  petsc-fs compare mine.h5 --options direct.opts "mine.opts -ksp_max_it 50" --rtol 1e-2..1e-10:2 --ranks 1 2 --out x
-  petsc-fs compare mine.h5 run.h5 --base contact_poromechanics.opts --options mine.opts --repeat 5
-  petsc-fs compare --again comparison/compare.json --out comparison     # pictures and page only
+  petsc-fs compare mine.h5 --options direct.opts "mine.opts -ksp_max_it 50" \\
+      --rtol 1e-2..1e-10:2 --ranks 1 2 --out comparison
+  petsc-fs compare mine.h5 run.h5 --options mine.opts --repeat 5 \\
+      --base contact_poromechanics.opts
+  petsc-fs compare --again comparison/compare.json --out comparison
 
 exit codes: 0 everything was measured, whatever the outcomes; 1 no reference solution; 2 wrong call; 3 no such scene"""
 
@@ -450,7 +454,7 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
         write_text(args.out / "compare.csv", to_csv(found))
         write_text(args.out / "compare.json", found.to_json())
         write_text(args.out / "compare.html", page(found, everything, pictures))
-        print(f"written: {args.out / 'compare.html'}, with compare.csv, compare.json and pictures beside it")
+        print(f"written: {args.out / 'compare.html'}, compare.csv, compare.json and pictures")
     return 0
 
 
@@ -517,8 +521,21 @@ def _variants(
 
 
 def _print(headings: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-    """A table for the terminal, in columns as wide as they need."""
-    cells = [[str(c) for c in row] for row in (headings, *rows)]
-    widths = [max(len(row[k]) for row in cells) for k in range(len(headings))]
+    """A table for a terminal of 80 columns; headings, and cells where it is needed, are broken between words.
+
+    The parts of a long name, as contact_poromechanics_fast, are words.
+    """
+    cells = [
+        [re.sub(r"\w{16,}", lambda name: name[0].replace("_", "_ "), str(c)) for c in row] for row in (headings, *rows)
+    ]
+    columns = list(zip(*cells, strict=True))
+    words = [max(map(len, " ".join(column).split())) for column in columns]
+    widths = [max(word, *map(len, column[1:])) for word, column in zip(words, columns, strict=True)]
+    gap = "  " if sum(widths) + 2 * len(widths) <= 82 else " "
+    while sum(widths) + len(widths) > 81 and widths != words:
+        widths[max(range(len(widths)), key=lambda k: (widths[k] > words[k], widths[k]))] -= 1
     for row in cells:
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+        parts = (textwrap.wrap(cell, width) for cell, width in zip(row, widths, strict=True))
+        for line in itertools.zip_longest(*parts, fillvalue=""):
+            padded = (part.replace("_ ", "_").ljust(width) for part, width in zip(line, widths, strict=True))
+            print(gap.join(padded).rstrip())

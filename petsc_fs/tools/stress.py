@@ -15,6 +15,7 @@ import json
 import math
 import os
 import tempfile
+import textwrap
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -282,7 +283,8 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
     cases = _chosen(args)
     if args.list:
         for case in cases:
-            print(f"{case.name:32} {case.group:18} {case.hard}  [{case.source}]")
+            about = textwrap.fill(f"{case.hard} [{case.source}]", 80, initial_indent="    ", subsequent_indent="    ")
+            print(f"{case.name} ({case.group})\n{about}")
         return 0
     started = time.perf_counter()
     if args.read:
