@@ -476,6 +476,7 @@ EXPECTED = {"good": "solved", "hungry": "out_of_memory", "hanging": "hang", "mis
 """Outcomes of `petsc_fs.tools.measure`, see its tests; limits are those of the sweep."""
 
 
+@pytest.mark.usefixtures("clean")  # of what lint puts into the database
 def test_each_way_to_end_is_recorded_as_what_it_is(tmp_path: Path) -> None:
     make(tmp_path, FAULTY, FAULTY_BASE)
     out = tmp_path / "out"
