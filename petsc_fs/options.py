@@ -54,6 +54,7 @@ NUMBERS: dict[str, tuple[float, float, bool]] = {
     "ksp_gmres_restart": (1, math.inf, True),
 }
 """Least value, value that is too large, and whether it is a whole number, of options that end in these names."""
+NO_OPTION = "is not an option; options start with '-'"
 TAKE_FILES = ("options_file", "petsc_fs_retry", "petsc_fs_retry_file")
 
 
@@ -87,21 +88,13 @@ def find_options_file(name: str) -> Path:
 
 @dataclass(frozen=True)
 class OptionsFile:
-    """What the header of a shipped options file says.
-
-    Attributes:
-        path: of the file.
-        purpose: first line.
-        fields: fields that a scene must have, no more and no fewer; empty if any will do.
-        default: whether `choose` takes it for these fields.
-        not_for: bundled scenes it is known to fail on.
-    """
+    """What the header of a shipped options file says."""
 
     path: Path
-    purpose: str
-    fields: tuple[str, ...]
-    default: bool
-    not_for: tuple[str, ...]
+    purpose: str  # first line
+    fields: tuple[str, ...]  # that a scene must have, no more and no fewer; empty if any will do
+    default: bool  # whether `choose` takes it for these fields
+    not_for: tuple[str, ...]  # bundled scenes it is known to fail on
 
     def fits(self, fields: Iterable[str]) -> bool:
         """Whether a scene with these fields can be solved by the file."""
@@ -112,14 +105,9 @@ def read_header(path: Path) -> OptionsFile:
     """Header of an options file: comment lines `# fields:`, `# default: yes` and `# not_for:`."""
     comments = [line[1:].strip() for line in _text(path).split("\n") if line.startswith("#")]
     entries = {m[1]: m[2] for m in (re.match(r"(\w+): *(.*)", c) for c in comments) if m}
-    fields = in_order(f for f in re.findall(r"\w+", entries.get("fields", "")) if f in FIELD_NAMES)
-    return OptionsFile(
-        path,
-        purpose=comments[0] if comments else "",
-        fields=fields,
-        default=entries.get("default") == "yes",
-        not_for=tuple(re.findall(r"\w+", entries.get("not_for", ""))),
-    )
+    names, not_for = (re.findall(r"\w+", entries.get(key, "")) for key in ("fields", "not_for"))
+    purpose = comments[0] if comments else ""
+    return OptionsFile(path, purpose, in_order(names), entries.get("default") == "yes", tuple(not_for))
 
 
 def fitting_file(name: str, fields: Iterable[str]) -> Path:
@@ -168,8 +156,8 @@ def _parse(path: Path, above: tuple[Path, ...]) -> Options:
     lines = []
     for number, line in enumerate(_text(path).split("\n"), start=1):
         words = re.findall(r"""["'][^"']*["']|\S+""", line.split("#")[0], re.ASCII)
-        if words and (words[0].startswith("--") or not is_option(words[0])):
-            raise UsageError(f"{path}:{number}: {words[0]!r} is not an option; options start with '-'")
+        if words and words[0].startswith("--"):
+            raise UsageError(f"{path}:{number}: {words[0]!r} {NO_OPTION}")
         lines.append((f"{path}:{number}: ", [word.strip("\"'") for word in words]))
     return _collect(lines, f"{path}: ", (*above, path.resolve()))
 
@@ -183,7 +171,8 @@ def _collect(lines: Iterable[tuple[str, Sequence[str]]], name: str, above: tuple
         while words:
             word = words.pop(0)
             if not is_option(word):
-                raise UsageError(f"{where}{word!r} belongs to no option: -{before} has its value already")
+                why = f"belongs to no option: -{before} has its value already" if before else NO_OPTION
+                raise UsageError(f"{where}{word!r} {why}")
             value = words.pop(0) if words and not is_option(words[0]) else None
             option = before = word.lstrip("-")
             _refuse_unclear(option, value, where)
@@ -213,10 +202,9 @@ def _refuse_unclear(option: str, value: str | None, where: str) -> None:
     strange = next((c for c in f"{option}{value}" if not c.isprintable()), None)
     if strange is not None and option != "options_file":
         raise UsageError(f"{where}-{option}: PETSc cannot take the character U+{ord(strange):04X}")
-    if option in ("prefix_push", "options_file") and not value:
-        raise UsageError(
-            f"{where}-{option} without {'a prefix' if option == 'prefix_push' else 'the name of the file'}"
-        )
+    needed = {"prefix_push": "a prefix", "options_file": "the name of the file"}.get(option)
+    if needed and not value:
+        raise UsageError(f"{where}-{option} without {needed}")
 
 
 def _text(path: Path) -> str:
@@ -277,16 +265,11 @@ class Facts:
 
     Contact always has its transformation Q_r: fracture cells open and close, and where J_11 is invertible multigrid
     still needs it.
-
-    Attributes:
-        fields: those with unknowns.
-        flow_moves_rock: pressure acts on the mechanics.
-        rock_moves_flow: displacements act on the flow.
     """
 
-    fields: tuple[str, ...]
-    flow_moves_rock: bool
-    rock_moves_flow: bool
+    fields: tuple[str, ...]  # those with unknowns
+    flow_moves_rock: bool  # pressure acts on the mechanics
+    rock_moves_flow: bool  # displacements act on the flow
 
     @classmethod
     def of(cls, scene: Scene, comm: MPI.Intracomm) -> Facts:
@@ -296,13 +279,12 @@ class Facts:
             return any(scene.blocks[rc].data.any() for rc in scene.blocks if rc[0] in rows and rc[1] in columns)
 
         found = comm.allgather((acts(MECHANICS, FLOW), acts(FLOW, MECHANICS)))
-        names = tuple(f for f in scene.fields if scene.sizes[f])
-        return cls(names, any(moves for moves, _ in found), any(moves for _, moves in found))
+        return cls(tuple(f for f in scene.fields if scene.sizes[f]), *map(any, zip(*found, strict=True)))
 
     def or_either(self, other: Facts) -> Facts:
         """What is true here or there, so that a level that was needed once is kept."""
-        moves_rock, moves_flow = self.flow_moves_rock, self.rock_moves_flow
-        return Facts(self.fields, moves_rock or other.flow_moves_rock, moves_flow or other.rock_moves_flow)
+        rock = self.flow_moves_rock or other.flow_moves_rock
+        return Facts(self.fields, rock, self.rock_moves_flow or other.rock_moves_flow)
 
     def left_out(self) -> Iterator[str]:
         """What of the canonical solver such a scene does not need, from the outermost level inwards."""
@@ -313,27 +295,19 @@ class Facts:
             yield NO_MECHANICS
         if not flow:
             yield NO_FLOW
-        elif mechanics and not (self.flow_moves_rock or self.rock_moves_flow):
-            yield DECOUPLED
         elif mechanics and not (self.flow_moves_rock and self.rock_moves_flow):
-            yield ONE_WAY
+            yield ONE_WAY if self.flow_moves_rock or self.rock_moves_flow else DECOUPLED
         if flow and "intf_flow" not in self.fields:
             yield NO_INTERFACE_FLOW
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The options of the smallest solver for a scene.
+    """The options of the smallest solver for a scene."""
 
-    Attributes:
-        values: by full name, in the order of elimination.
-        file: shipped file that they are those of; None if they are cut from the canonical one.
-        left_out: what of the canonical solver is not there, a line each.
-    """
-
-    values: Options = field(default_factory=dict)
-    file: Path | None = None
-    left_out: tuple[str, ...] = ()
+    values: Options = field(default_factory=dict)  # by full name, in the order of elimination
+    file: Path | None = None  # shipped file that they are those of; None if they are cut from the canonical one
+    left_out: tuple[str, ...] = ()  # what of the canonical solver is not there, a line each
 
     def text(self, title: str) -> str:
         """An options file, with a comment for each part left out."""
@@ -364,12 +338,7 @@ def choose(facts: Facts) -> Choice:
 
 
 def cut(canonical: Mapping[str, str | None], facts: Facts) -> Options:
-    """What is left of the canonical options where levels have nothing to do: those inside move up.
-
-    Args:
-        canonical: options of the file with all levels.
-        facts: about the scene.
-    """
+    """What is left of the options of the file with all levels where some have nothing to do: those inside move up."""
     level_1 = _under(canonical, "qr_")
     level_2 = _under(level_1, "fieldsplit_1_")
     stress = _under(level_2, "fieldsplit_1_")
@@ -431,17 +400,9 @@ def _put(prefix: str, options: Options) -> Options:
 # PETSc's database
 
 
-def insert(path: Path, prefix: str = "") -> None:
-    """Put the options of a file into PETSc's database, except those that are set there already. Local.
-
-    Args:
-        path: of the options file.
-        prefix: put before each name.
-
-    Raises:
-        UsageError: see `parse`.
-    """
-    insert_all(parse(path), prefix)
+def insert(path: Path, prefix: str = "") -> tuple[str, ...]:
+    """Put the options of a file into PETSc's database, see `parse` and `insert_all`. Local."""
+    return insert_all(parse(path), prefix)
 
 
 def insert_all(values: Mapping[str, str | None], prefix: str = "") -> tuple[str, ...]:
@@ -477,12 +438,8 @@ def delete_all(names: Iterable[str]) -> None:
 def inserted(values: Path | Mapping[str, str | None], prefix: str = "") -> Iterator[None]:
     """Have options in PETSc's database within a block; what is set there already stays. Local.
 
-    Args:
-        values: options file, or options by name.
-        prefix: put before each name.
-
     Raises:
-        UsageError: see `parse`.
+        UsageError: it is a file, see `parse`.
     """
     new = insert_all(parse(values) if isinstance(values, Path) else values, prefix)
     try:
@@ -492,20 +449,15 @@ def inserted(values: Path | Mapping[str, str | None], prefix: str = "") -> Itera
 
 
 def number(name: str, default: Number, prefix: str = "") -> Number:
-    """An option of this package as a number, a whole one where the default is. Local.
-
-    Raises:
-        UsageError: it is no such number.
-    """
+    """An option of this package as a number, a whole one where the default is, or a UsageError. Local."""
     from petsc4py import PETSc
 
     given = PETSc.Options(prefix)
-    whole = isinstance(default, int)
+    read, expected = (given.getInt, "a whole number") if isinstance(default, int) else (given.getReal, "a number")
     try:
-        found: Number = given.getInt(name, default) if whole else given.getReal(name, default)
+        found: Number = read(name, default)
         return found
     except PETSc.Error:
-        expected = "a whole number" if whole else "a number"
         raise UsageError(f"-{prefix}{name} {given.getString(name, '')}: expected {expected}") from None
 
 
@@ -589,16 +541,11 @@ class Given:
 
     Options:
         -petsc_fs_allow_unused <none> (patterns, separated by commas): options that may do nothing, such as my_*.
-
-    Attributes:
-        typed: names on the command line.
-        values: all of them, those of options files included, in the order in which they count.
-        files: the options files.
     """
 
-    typed: frozenset[str]
-    values: Options
-    files: tuple[Path, ...]
+    typed: frozenset[str]  # names on the command line
+    values: Options  # all of them, those of options files included, in the order in which they count
+    files: tuple[Path, ...]  # the options files
 
     @classmethod
     def of(cls, words: Sequence[str]) -> Given:
@@ -634,8 +581,7 @@ class Given:
     def judge(self, comm: MPI.Intracomm, left_out: Iterable[str] = ()) -> str:
         """Complain about options that nothing on any rank has asked for, after a solve. Collective.
 
-        Returns:
-            a warning about those of PETSC_OPTIONS, which may be meant for other programs; "" if there are none.
+        Returns a warning about those of PETSC_OPTIONS, which may be meant for other programs; "" if there are none.
 
         Raises:
             UsageError: there are others, on all ranks.

@@ -1,29 +1,39 @@
 """Preconditioners that go wrong, for tests of what becomes of it."""
 
 import os
-import signal
 import time
 
-import numpy as np
-from petsc4py import PETSc
+from petsc_fs.errors import SolveError
 
 
-class Crashing:
-    def setUp(self, pc: PETSc.PC) -> None:
-        os.kill(os.getpid(), signal.SIGSEGV)
+class Crash:
+    def setUp(self, pc):
+        os.abort()
 
 
-class Hanging:
-    def setUp(self, pc: PETSc.PC) -> None:
+class Exit:
+    def setUp(self, pc):
+        os._exit(3)
+
+
+class Hang:
+    def setUp(self, pc):
         time.sleep(3600)
 
 
-class Hungry:
-    def setUp(self, pc: PETSc.PC) -> None:
-        self.much = np.empty(2**38)  # two terabytes
+class Greedy:
+    def setUp(self, pc):
+        self.much = bytearray(2**40)
 
 
-class Growing:
-    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+class Lonely:
+    def setUp(self, pc):
+        if pc.comm.rank:
+            raise SolveError("only here")
+        pc.comm.tompi4py().Barrier()
+
+
+class Wrong:
+    def apply(self, pc, x, y):
         x.copy(y)
-        y.scale(1e9)
+        y.scale(float("nan"))

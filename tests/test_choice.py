@@ -1,7 +1,6 @@
 """The smallest solver of a scene: exactly the levels that it needs, as -ksp_view shows them, and the same answer."""
 
 import json
-import os
 import re
 import subprocess
 import sys
@@ -11,46 +10,28 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from common import comm, load, times, unequal
 from mpi4py import MPI
 from petsc4py import PETSc
-from sample import SCENES, dense
+from programs import ENVIRONMENT, MPIEXEC
+from sample import dense
 
-import petsc_fs
 from petsc_fs import options
 from petsc_fs.errors import UsageError
 from petsc_fs.fields import FIELD_NAMES
-from petsc_fs.io import hdf5
 from petsc_fs.options import Facts
 from petsc_fs.partition import Layout
 from petsc_fs.scene import CSR, Scene
 from petsc_fs.solver import Result, Solver
 from petsc_fs.tools import stress_cases
 
-comm = MPI.COMM_WORLD
-MPIEXEC = Path(petsc_fs.__path__[0]).parent / "scripts" / "mpiexec"
-ENVIRONMENT = dict(os.environ, OMP_NUM_THREADS="1")
 BUNDLED = ("biot", "contact", "flow", "model1", "model2", "model3")
 
 Levels = dict[str, str]
 """Type of each PC by its prefix."""
 
 
-# Scenes made from the bundled ones, and a layout
-
-
-def load(name: str) -> Scene:
-    return hdf5.read(SCENES / f"{name}.h5")
-
-
-def unequal(scene: Scene) -> Layout:
-    """All fracture cells on the last rank, nothing but rock on the others."""
-    cells = {}
-    for f in scene.fields:
-        n = scene.sizes[f] // scene.block_size(f)
-        rock = f in ("momentum", "mass")
-        shares = np.diff((n * np.arange(comm.size + 1)) // comm.size)
-        cells[f] = shares if rock else np.where(np.arange(comm.size) == comm.size - 1, n, 0)
-    return Layout.from_cells(comm, scene.dimension, cells)
+# Scenes made from the bundled ones
 
 
 def smooth(scene: Scene) -> Scene:
@@ -62,21 +43,16 @@ def smooth(scene: Scene) -> Scene:
         size = np.abs(scene.reference[f]).mean() if n else 1.0
         x[f] = size * np.stack([1 + np.sin((i + 1) * place) for i in range(components)], axis=1).ravel()
     rhs = {f: np.zeros(n) for f, n in scene.sizes.items()}
-    for (r, c), (indptr, indices, data) in scene.blocks.items():
-        rows = np.repeat(np.arange(indptr.size - 1), np.diff(indptr))
-        rhs[r] += np.bincount(rows, data * x[c][indices], minlength=indptr.size - 1)
+    for (r, c), block in scene.blocks.items():
+        rhs[r] += times(block, x[c]).astype(float)
     return replace(scene, rhs=rhs, reference=x)
-
-
-def identity(n: int, factor: float = 1.0) -> CSR:
-    return CSR(np.arange(n + 1), np.arange(n), np.full(n, factor))
 
 
 def all_open(scene: Scene) -> Scene:
     """No contact anywhere: the traction is given, whatever the displacements."""
     n = scene.sizes["contact"]
     blocks = {rc: b for rc, b in scene.blocks.items() if rc[0] != "contact"}
-    blocks["contact", "contact"] = identity(n)
+    blocks["contact", "contact"] = CSR(np.arange(n + 1), np.arange(n), np.ones(n))
     return smooth(replace(scene, blocks=blocks, contact_state=np.full(n // scene.dimension, 2)))
 
 
@@ -220,15 +196,6 @@ def test_scene_without_some_fields_has_exactly_the_levels_of_the_others(solve, n
     solved.assert_smallest(SUBSETS[fields])
     if (name, fields) != CLOSED:
         solved.assert_solved()
-
-
-@pytest.mark.mpi
-@pytest.mark.parametrize("name", BUNDLED)
-def test_bundled_scene_has_the_levels_of_its_fields(solve, name):
-    scene = load(name)
-    solved = solve(scene)
-    solved.assert_smallest(SUBSETS[scene.fields])
-    solved.assert_solved()
 
 
 @pytest.mark.mpi
@@ -385,26 +352,23 @@ def test_scene_without_unknowns_is_refused():
 
 
 def run(*arguments: object, cwd: Path, ranks: int = 1, **environment: str) -> subprocess.CompletedProcess[str]:
-    command = [*([str(MPIEXEC), "-n", str(ranks)] if ranks > 1 else []), sys.executable, "-m", "petsc_fs"]
-    return subprocess.run(
-        [*command, *map(str, arguments)],
-        cwd=cwd,
-        env=ENVIRONMENT | environment,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    command = [*([str(MPIEXEC), "-n", str(ranks)] if ranks > 1 else []), sys.executable, *map(str, arguments)]
+    how = {"cwd": cwd, "env": ENVIRONMENT | environment, "timeout": 60}
+    return subprocess.run(command, capture_output=True, text=True, check=False, **how)
+
+
+def petsc_fs(*arguments: object, **more: object) -> subprocess.CompletedProcess[str]:
+    return run("-m", "petsc_fs", *arguments, **more)
 
 
 @pytest.mark.parametrize("name", BUNDLED)
 def test_printed_options_solve_to_the_last_digit_as_without(tmp_path, name):
-    printed = run("options", f"{name}.h5", cwd=tmp_path)
+    printed = petsc_fs("options", f"{name}.h5", cwd=tmp_path)
     assert printed.returncode == 0, printed.stderr
     (tmp_path / "mine.opts").write_text(printed.stdout)
     reports = []
     for more in ([], ["-options_file", "mine.opts"]):
-        done = run("solve", f"{name}.h5", "--report", "report.json", *more, cwd=tmp_path)
+        done = petsc_fs("solve", f"{name}.h5", "--report", "report.json", *more, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         reports.append(json.loads((tmp_path / "report.json").read_text()))
     for key in ("iterations", "reason", "true_relative_residual", "residual_by_field", "error_by_field"):
@@ -415,69 +379,43 @@ def test_printed_options_solve_to_the_last_digit_as_without(tmp_path, name):
 MISSPELT = "qr_fieldsplit_1_fieldsplit_mechanics_component_pc_hypre_boomeramg_stong_threshold"
 
 
-@pytest.mark.parametrize("ranks", [1, 2])
-@pytest.mark.parametrize("origin", ["the command line", "mine.opts", "PETSC_OPTIONS"])
-def test_misspelt_option_is_told_with_its_origin(tmp_path, origin, ranks):
-    (tmp_path / "mine.opts").write_text(
-        f"{choice_of(load('model1')).text('mine')}\n-{MISSPELT} 0.7\n" if origin == "mine.opts" else ""
-    )
-    arguments = {"the command line": [f"-{MISSPELT}", "0.7"], "mine.opts": ["-options_file", "mine.opts"]}
-    environment = {"PETSC_OPTIONS": f"-{MISSPELT} 0.7"} if origin == "PETSC_OPTIONS" else {}
-    done = run("solve", "model1.h5", *arguments.get(origin, []), cwd=tmp_path, ranks=ranks, **environment)
-    assert done.returncode == (0 if environment else 2), done.stderr
-    assert done.stderr.count("petsc-fs: warning: ") == len(environment)
+def test_misspelt_option_of_a_file_is_told_once(tmp_path):
+    """Others: see test_cli."""
+    (tmp_path / "mine.opts").write_text(f"{choice_of(load('model1')).text('mine')}\n-{MISSPELT} 0.7\n")
+    done = petsc_fs("solve", "model1.h5", "-options_file", "mine.opts", cwd=tmp_path, ranks=2)
     right = MISSPELT.replace("stong", "strong")
-    message = f"option -{MISSPELT} from {origin} was not used; did you mean -{right}"
-    assert done.stderr.count(message) == 1
-    assert "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize("ranks", [1, 2])
-def test_option_that_may_be_idle_is_let_pass(tmp_path, ranks):
-    idle = [f"-{MISSPELT}", "0.7", "-petsc_fs_allow_unused", "mine_*,*stong*"]
-    done = run("solve", "model1.h5", *idle, cwd=tmp_path, ranks=ranks)
-    assert done.returncode == 0, done.stderr
-    done = run("solve", "model1.h5", *idle, "-yours_x", "1", cwd=tmp_path, ranks=ranks)
     assert done.returncode == 2
-    assert "option -yours_x from the command line was not used" in done.stderr
-    assert "stong" not in done.stderr
+    assert done.stderr.count(f"option -{MISSPELT} from mine.opts was not used; did you mean -{right}") == 1
+
+
+PARTS = {
+    "contact": "no contact: Q_r and the first Schur level left out",
+    "mechanics": "no mechanics: the second Schur level with fixed stress left out",
+    "flow": "no flow: the second and third Schur levels left out",
+    "intf_flow": "no interface flow: the third Schur level left out",
+}
 
 
 @pytest.mark.parametrize(
-    ("name", "option", "reason"),
+    ("name", "option", "part"),
     [
-        ("flow", "qr_side", "no contact: Q_r and the first Schur level left out"),
-        ("biot", "qr_fieldsplit_contact_pc_type", "no contact: Q_r and the first Schur level left out"),
-        (
-            "flow",
-            "qr_fieldsplit_1_fieldsplit_mechanics_pc_type",
-            "no mechanics: the second Schur level with fixed stress left out",
-        ),
-        ("contact", "qr_fieldsplit_1_fieldsplit_1_fs_damping", "no flow: the second and third Schur levels left out"),
-        (
-            "biot",
-            "qr_fieldsplit_1_fieldsplit_1_fs_fieldsplit_intf_flow_pc_type",
-            "no interface flow: the third Schur level left out",
-        ),
+        ("flow", "qr_side", "contact"),
+        ("biot", "qr_fieldsplit_contact_pc_type", "contact"),
+        ("flow", "qr_fieldsplit_1_fieldsplit_mechanics_pc_type", "mechanics"),
+        ("contact", "qr_fieldsplit_1_fieldsplit_1_fs_damping", "flow"),
+        ("biot", "qr_fieldsplit_1_fieldsplit_1_fs_fieldsplit_intf_flow_pc_type", "intf_flow"),
     ],
 )
-def test_option_of_a_level_left_out_is_named_with_the_reason(tmp_path, name, option, reason):
-    done = run("solve", f"{name}.h5", f"-{option}", "0.5", cwd=tmp_path)
+def test_option_of_a_level_left_out_is_named_with_the_reason(tmp_path, name, option, part):
+    done = petsc_fs("solve", f"{name}.h5", f"-{option}", "0.5", cwd=tmp_path)
     assert done.returncode == 2
-    assert f"option -{option} from the command line was not used: its level is not there ({reason})" in done.stderr
+    reason = f"its level is not there ({PARTS[part]})"
+    assert f"option -{option} from the command line was not used: {reason}" in done.stderr
 
 
 def test_flow_alone_imports_only_what_it_uses(tmp_path):
     program = "import sys; from petsc_fs.cli.main import main; print(main(['solve', 'flow.h5'])); print(*sys.modules)"
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        cwd=tmp_path,
-        env=ENVIRONMENT,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    done = run("-c", program, cwd=tmp_path)
     *_, code, names = done.stdout.splitlines()
     assert code == "0", done.stderr
     imported = set(names.split())

@@ -46,23 +46,6 @@ def test_header_states_purpose_source_and_fields(file):
     assert "# fields: " in text
 
 
-@pytest.mark.parametrize("file", options.shipped(), ids=lambda f: f.path.stem)
-def test_every_level_names_its_ksp(file):
-    """A pc_type below the outermost one stands beside a ksp_type with the same prefix."""
-    prefixes, pcs, ksps = [""], [], []
-    for line in (raw.split("#")[0].split() for raw in file.path.read_text().splitlines()):
-        if line[:1] == ["-prefix_push"]:
-            prefixes.append(prefixes[-1] + line[1])
-        elif line[:1] == ["-prefix_pop"]:
-            prefixes.pop()
-        elif line:
-            name = prefixes[-1] + line[0][1:]
-            pcs += [name.removesuffix("pc_type")] if name.endswith("pc_type") else []
-            ksps += [name.removesuffix("ksp_type")] if name.endswith("ksp_type") else []
-    inner_of_python_pc = {p for p in pcs if p.endswith(("qr_", "fs_", "component_", "assembled_"))}
-    assert set(pcs) - inner_of_python_pc == set(ksps)
-
-
 def test_iterations_do_not_depend_on_the_transformation(database):
     """Right and left transformation are equally good, as the paper says."""
     counts = {}

@@ -6,8 +6,9 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -68,41 +69,20 @@ def make(folder: Path, text: str = SPACE, base: str = BASE) -> space.Space:
     return space.read(folder / "some.yaml")
 
 
-class First:
-    """A sampler that takes the choice wanted, or else the first or least."""
-
-    def __init__(self, **wanted: str) -> None:
-        self.wanted = wanted
-
-    def suggest_categorical(self, name: str, choices: Sequence[str]) -> str:
-        return self.wanted.get(name.partition(".")[2], choices[0])
-
-    def suggest_int(self, name: str, low: int, high: int, *, step: int = 1) -> int:
-        return low
-
-    def suggest_float(self, name: str, low: float, high: float, **how: Any) -> float:
-        return low
-
-
 # --- spaces
 
 
 def test_parameters_exist_where_their_conditions_hold(tmp_path: Path) -> None:
+    wanted = {"all.ksp_type": "gmres", "all.ksp_gmres_restart": 10, "all.pc_asm_overlap": space.ABSENT}
+    wanted |= {"all.ksp_divtol": 1e3, "sub.pc_type": "ilu", "sub.pc_factor_levels": 0.0}
     some = make(tmp_path)
-    assert some.suggest(First()) == {
-        "all.ksp_type": "gmres",
-        "all.ksp_gmres_restart": 10,
-        "all.pc_asm_overlap": space.ABSENT,
-        "all.ksp_divtol": 1e3,
-        "sub.pc_type": "ilu",
-        "sub.pc_factor_levels": 0.0,
-    }
-    other = some.suggest(First(ksp_type="bcgs", pc_asm_overlap="2"))
-    assert other == {"all.ksp_type": "bcgs", "all.pc_asm_overlap": "2", "sub.pc_type": "ilu"}
+    assert some.suggest(optuna.trial.FixedTrial(wanted)) == wanted
+    other = {"all.ksp_type": "bcgs", "all.pc_asm_overlap": "2", "sub.pc_type": "ilu"}
+    assert some.suggest(optuna.trial.FixedTrial(wanted | other)) == other
 
 
 def test_grid_has_each_combination_of_existing_parameters_once(tmp_path: Path) -> None:
-    grid = list(make(tmp_path).grid())
+    grid = make(tmp_path).grid()
     # gmres: 3 restarts · (3 divtol + 2 overlaps) · (2 levels + jacobi); fgmres: 3 · 5 · 2; bcgs: 5 · 2
     assert len(grid) == 3 * 5 * 3 + 3 * 5 * 2 + 5 * 2
     assert len({json.dumps(values) for values in grid}) == len(grid)
@@ -137,12 +117,10 @@ def test_edited_file_has_exactly_the_changes(file: Path, data: st.DataObject) ->
     changes = data.draw(st.dictionaries(some, st.none() | st.sampled_from(["1", "abc"]), max_size=5))
     text = space.edit(file.read_text(), changes)
     wanted = {k: v for k, v in (before | changes).items() if not (k in changes and v is None)}
-    path = Path(os.environ.get("TMPDIR", "/tmp")) / f"edited-{os.getpid()}.opts"
-    path.write_text(text)
-    try:
-        assert options.parse(path) == wanted
-    finally:
-        path.unlink()
+    with tempfile.NamedTemporaryFile("w") as target:
+        target.write(text)
+        target.flush()
+        assert options.parse(Path(target.name)) == wanted
     assert [line for line in text.splitlines() if line.lstrip().startswith("#")] == [
         line for line in file.read_text().splitlines() if line.lstrip().startswith("#")
     ]
@@ -193,7 +171,7 @@ A = "base: base.opts\ngroups:\n  a:\n    parameters:\n      "
         (A + "x: {integer: [0.5, 2]}", "expected whole numbers, found [0.5, 2]; or take 'float'"),
         (A + "x: {integer: [1, 9], step: 0.5}", "step: expected a positive number, found 0.5"),
         (A + "x: {log: [0, 1]}", "values must be positive, found 0; take 'float'"),
-        (A + "x: {float: [0, 1], start: 2}", "start 2 is outside of [0, 1]"),
+        (A + "x: {float: [0, 1], start: 2}", "start 2 is no number in [0, 1]"),
         (A + "x: {float: [0, 1], points: 1}", "a grid needs both ends"),
         (A + "'x y': {float: [0, 1]}", "'x y' is no name of an option"),
         (A + "x: {float: [0, 1], when: {y: 1}}", "there is no parameter a.y before this one; declare it before"),
@@ -216,18 +194,9 @@ SCENE_A, SCENE_B = SCENES / "flow.h5", SCENES / "biot.h5"
 
 
 def record(seconds: float = 1.0, **more: Any) -> measure.Record:
-    return measure.EMPTY | {
-        "kind": "converged",
-        "message": "",
-        "seconds": {"setup": seconds / 2, "solve": seconds / 2},
-        "cpu_seconds": {"setup": seconds, "solve": seconds},
-        "iterations": 7,
-        "peak_rss": [300],
-        "base_rss": [100],
-        "true_residual": 1e-9,
-        "forward_error": 1e-8,
-        **more,
-    }
+    found = {"kind": "converged", "message": "", "iterations": 7, "true_residual": 1e-9, "forward_error": 1e-8}
+    found |= {"seconds": {"setup": seconds / 2, "solve": seconds / 2}, "peak_rss": [300], "base_rss": [100]}
+    return measure.EMPTY | found | {"cpu_seconds": {"setup": seconds, "solve": seconds}} | more
 
 
 Measured = Callable[[dict[str, str | None]], measure.Record]
@@ -240,7 +209,7 @@ def made_up(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[tuple[str, st
     def install(measured: Measured, on_disk: bool = False) -> list[tuple[str, str]]:
         calls: list[tuple[str, str]] = []
 
-        def fake(job: measure.Job, *, mpiexec: object = None) -> list[measure.Record]:
+        def fake(job: measure.Job) -> list[measure.Record]:
             (scene,) = job.scenes
             calls.append((Path(scene).name, Path(str(job.options_file)).name))
             found = measured(options.parse(Path(str(job.options_file))))
@@ -360,7 +329,7 @@ def test_base_file_that_fails_ends_the_sweep(tmp_path: Path, made_up: Any) -> No
 
 def test_memory_and_processor_time_can_be_what_counts(tmp_path: Path, made_up: Any) -> None:
     made_up(by_restart)
-    results = Sweep(settings(tmp_path, objectives=("memory",), clock="cpu", trials=30)).run()
+    results = Sweep(settings(tmp_path, objective=("memory",), clock="cpu", trials=30)).run()
     assert results["trials"][results["final"]["best"]]["values"]["all.ksp_gmres_restart"] == 50
     assert results["front_objectives"] == ["memory", "time"]
     assert results["final"]["finalists"][str(results["final"]["best"])]["flow.h5"]["base"]["seconds"] == 2.0
@@ -392,7 +361,7 @@ from pathlib import Path
 from petsc_fs.tools import measure, sweep
 from tests.test_sweep import by_restart, options, settings
 
-def slow(job, *, mpiexec=None):
+def slow(job):
     time.sleep(0.15)
     return [by_restart(options.parse(Path(job.options_file))) | {"scene": job.scenes[0]}]
 
@@ -447,7 +416,7 @@ def test_trial_that_was_measured_but_not_ended_is_not_repeated(
         tell = Sweep._tell
 
         def interrupted(sweep: Sweep, attempt: Any) -> None:
-            if attempt.number == 2:
+            if attempt["number"] == 2:
                 raise KeyboardInterrupt
             tell(sweep, attempt)
 
@@ -498,32 +467,17 @@ groups:
       which:
         choices:
           good: {assembled_pc_factor_mat_solver_type: mumps}
-          diverging: {pc_python_type: tests.faulty.Growing, ksp_type: richardson, ksp_max_it: 3, ksp_pc_side: ~,
-                      assembled_pc_type: ~}
-          stagnating: {assembled_pc_type: ilu, ksp_max_it: 30}
-          crashing: {pc_python_type: tests.faulty.Crashing, assembled_pc_type: ~}
-          hanging: {pc_python_type: tests.faulty.Hanging, assembled_pc_type: ~}
-          hungry: {pc_python_type: tests.faulty.Hungry, assembled_pc_type: ~}
+          hungry: {pc_python_type: tests.faulty.Greedy, assembled_pc_type: ~}
+          hanging: {pc_python_type: tests.faulty.Hang, assembled_pc_type: ~}
           misspelt: {assembled_pc_factor_mat_solver_tpye: mumps}
-          impossible: {assembled_pc_type: ul}
 """
 
-EXPECTED = {
-    "good": "solved",
-    "diverging": "diverged",
-    "stagnating": "stagnated",
-    "crashing": "crash",
-    "hanging": "hang",
-    "hungry": "out_of_memory",
-    "misspelt": "unused_option",
-    "impossible": "refused",
-}
+EXPECTED = {"good": "solved", "hungry": "out_of_memory", "hanging": "hang", "misspelt": "unused_option"}
+"""Outcomes of `petsc_fs.tools.measure`, see its tests; limits are those of the sweep."""
 
 
-def test_each_way_to_fail_is_recorded_as_what_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(HERE.parent))
+@pytest.mark.usefixtures("clean")  # of what lint puts into the database
+def test_each_way_to_end_is_recorded_as_what_it_is(tmp_path: Path) -> None:
     make(tmp_path, FAULTY, FAULTY_BASE)
     out = tmp_path / "out"
     arguments = ["sweep", "flow.h5", "--space", str(tmp_path / "some.yaml"), "--sampler", "grid", "--trials", "20"]
@@ -534,25 +488,20 @@ def test_each_way_to_fail_is_recorded_as_what_it_is(
     assert {t["values"]["all.which"]: t["outcome"] for t in results["trials"]} == EXPECTED
     said = {t["values"]["all.which"]: t["message"] for t in results["trials"]}
     assert "assembled_pc_factor_mat_solver_type" in said["misspelt"]  # what it might have meant
-    assert "SIGSEGV" in said["crashing"]
     assert "within 10 s" in said["hanging"]
     assert results["outcomes"] == dict.fromkeys(EXPECTED.values(), 1)
 
     assert main(["lint", str(out / "best.opts")]) == 0
     header = options.read_header(out / "best.opts")
-    assert header.fields == ("intf_flow", "mass")
-    assert not header.default
-    assert options.parse(out / "best.opts") == options.parse(tmp_path / "base.opts") | {
-        "assembled_pc_factor_mat_solver_type": "mumps"
-    }
+    assert (header.fields, header.default) == (("intf_flow", "mass"), False)
+    best = options.parse(tmp_path / "base.opts") | {"assembled_pc_factor_mat_solver_type": "mumps"}
+    assert options.parse(out / "best.opts") == best
     for page in (out / "report.md", tmp_path / "page.md"):
         text = page.read_text()
         assert all(kind in text for kind in EXPECTED.values())
         picture = re.search(r"!\[.*\]\((.*)\)", text)
         assert picture is not None
         assert (page.parent / picture[1]).stat().st_size > 1000
-    command = [sys.executable, "-m", "petsc_fs", "solve", "flow.h5", "-options_file", str(out / "best.opts")]
-    assert subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode == 0
 
 
 def test_results_without_a_solved_trial_are_written_all_the_same(tmp_path: Path, made_up: Any) -> None:
@@ -575,7 +524,7 @@ def test_results_without_a_solved_trial_are_written_all_the_same(tmp_path: Path,
         (["flow.h5", "--space", "nothing"], 2, "space nothing: no such file; shipped are amg.yaml, flow.yaml"),
         (["model1.h5", "--space", "flow"], 2, "model1.h5: flow.opts is for scenes with the fields intf_flow, mass"),
         (["flow.h5", "flow.h5", "--space", "flow"], 2, "flow.h5: named twice"),
-        (["flow.h5", "--space", "flow", "--trials", "0"], 2, "--trials 0: expected a positive number"),
+        (["flow.h5", "--space", "flow", "--trials", "0"], 2, "--trials: expected a positive number, found 0"),
         (["flow.h5", "--space", "flow", "--patience", "0.5"], 2, "--patience 0.5: expected at least 1, or 0 for never"),
         (["flow.h5", "--space", "flow", "--rtol", "2"], 2, "--rtol 2: expected a number between 0 and 1"),
         (["none.h5", "--space", "flow"], 3, "none.h5: no such file"),

@@ -86,10 +86,17 @@ def _lines(args: argparse.Namespace) -> list[str]:
 
 def contraction_text(found: Contraction) -> str:
     """The terms of the convergence condition, which of them dominates, and what the scene does not meet."""
-    from petsc_fs.tools.contraction import FORMULAS
+    from petsc_fs.tools.contraction import FORMULAS, VIOLATIONS
+
+    def spread(values: NDArray[np.float64] | None) -> tuple[str, ...]:
+        s = found.summary(values)
+        if not s["cells"]:
+            return ("0", "", "", "", "")
+        at = "" if s["max_at_m"] is None else ", ".join(f"{round(x)}" for x in s["max_at_m"])
+        return (str(s["cells"]), *(f"{s[what] + 0.0:.1e}" for what in ("min", "median", "max")), at)
 
     rows = [
-        (name, *_spread(found.terms.get(name), found), f"{found.theorem[name]:.1e}" if name in found.theorem else "?")
+        (name, *spread(found.terms.get(name)), f"{found.theorem[name]:.1e}" if name in found.theorem else "?")
         for name in FORMULAS
     ]
     parts = [
@@ -104,25 +111,7 @@ def contraction_text(found: Contraction) -> str:
     parts.append(f"condition: {found.verdict}" + (f"; {found.dominant} dominates" if found.dominant else ""))
     if found.rate is not None:
         parts.append(f"where it holds, every iteration reduces the error at least by the factor {found.rate:.3f}")
-    if found.slip.size:
-        violations = {
-            "slip of sticking cells, m": found.slip,
-            "c slip / friction bound": found.slip_over_bound,
-            "Coulomb mismatch eps, Pa": found.mismatch,
-            "eps / |y|": found.mismatch_over_trial,
-        }
-        rows = [(name, *_spread(values, found)) for name, values in violations.items()]
-        parts += ["", "against its assumptions", table(["", *SPREAD], rows)]
+    if found.violations:
+        words = [(VIOLATIONS[name], *spread(values)) for name, values in found.violations.items()]
+        parts += ["", "against its assumptions", table(["", *SPREAD], words)]
     return "\n".join([*parts, wrapped(f"- {note}" for note in found.notes)])
-
-
-def _spread(values: NDArray[np.float64] | None, found: Contraction) -> tuple[str, ...]:
-    """Number of cells that have a value, least, median and greatest, and the place of the greatest."""
-    from petsc_fs.tools.contraction import summary
-
-    numbers = None if values is None else summary(values)
-    if values is None or numbers is None:
-        return ("0", "", "", "", "")
-    *sizes, cell = numbers
-    at = "" if found.centers is None else ", ".join(f"{round(x)}" for x in found.centers[cell])
-    return (str(np.count_nonzero(~np.isnan(values))), *(f"{x + 0.0:.1e}" for x in sizes), at)

@@ -1,13 +1,12 @@
 """Compare options files: error against seconds, or seconds against those of a base file, on any scenes and ranks.
 
-Each combination of scene, options file and number of ranks is measured in processes of its own, all of them once
-before any is measured again and each time in another order, so that noise falls on all alike. The reference solution
-of each scene is computed first, in a process of its own, see `petsc_fs.tools.reference`.
+See `METHOD` for how, and `petsc_fs.tools.reference` for the reference solution of each scene, which comes first.
 """
 
 from __future__ import annotations
 
 import argparse
+import base64
 import csv
 import io
 import itertools
@@ -18,9 +17,11 @@ import signal
 import sys
 import textwrap
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from html import escape
 from pathlib import Path
+from statistics import geometric_mean, median
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,17 +29,9 @@ import numpy as np
 from petsc_fs import options
 from petsc_fs.errors import UsageError
 from petsc_fs.io.files import write_text
-from petsc_fs.tools.measure import (
-    CLOCKS,
-    Job,
-    Record,
-    Variant,
-    describe_machine,
-    grown,
-    measure_all,
-    seconds_of,
-    split_ranks,
-)
+from petsc_fs.tools import measure
+from petsc_fs.tools.measure import CLOCKS, Job, Record, Variant, grown, positive, say, seconds_of
+from petsc_fs.tools.pages import hypertext
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -75,8 +68,8 @@ class Case:
 
         if sequence.is_sequence(path):
             contents = sequence.read_contents(path)
-            first = contents.steps[0]
-            return cls(path.stem, str(path), first.dimension, first.sizes, contents.model, len(contents.steps))
+            first, model, steps = contents.steps[0], contents.model, len(contents.steps)
+            return cls(path.stem, str(path), first.dimension, first.sizes, model, steps)
         dimension, sizes = hdf5.read_sizes(path)
         with hdf5.open_file(path) as file:
             model = str(file.attrs["model"])
@@ -110,11 +103,10 @@ class Comparison:
     def from_json(cls, text: str) -> Comparison:
         """Read what `to_json` wrote."""
         data = json.loads(text)
-        cases = tuple(Case(**case) for case in data.pop("cases"))
-        lists = ("fields", "not_for")
-        variants = tuple(Variant(**(v | {k: tuple(v[k]) for k in lists})) for v in data.pop("variants"))
-        ranks, rtols = tuple(data.pop("ranks")), tuple(data.pop("rtols"))
-        return cls(cases=cases, variants=variants, ranks=ranks, rtols=rtols, **data)
+        cases = tuple(Case(**case) for case in data["cases"])
+        variants = tuple(Variant(**v) for v in data["variants"])
+        exact = {name: tuple(data[name]) for name in ("ranks", "rtols")}
+        return cls(**(data | exact | {"cases": cases, "variants": variants}))
 
 
 @dataclass(frozen=True)
@@ -148,7 +140,7 @@ class Point:
     iterations: float
     error: float  # forward error; NaN where there is no reference
     residual: float  # true residual
-    seconds: dict[str, Spread]  # of "read", "setup", "solve", and "total" of the last two
+    seconds: dict[str, Spread]  # of "setup", "solve", and "total" of both
     ratios: dict[str, Spread]  # of "setup", "solve" and "total" to those of the base file in the same round
     memory: float  # bytes that all ranks' memory grew by
 
@@ -159,45 +151,39 @@ def points(found: Comparison) -> list[Point]:
     groups: dict[tuple[Any, ...], dict[int, Record]] = {}
     for r in found.records:
         groups.setdefault((r["scene"], r["ranks"], r["rtol"], r["variant"]), {})[r["round"]] = r
+    ended = {key: {k: r for k, r in runs.items() if r["kind"] in ENDED} for key, runs in groups.items()}
     rows = []
     for (scene, ranks, rtol, file), runs in groups.items():
-        good = {k: r for k, r in runs.items() if r["kind"] in ENDED}
+        good = ended[scene, ranks, rtol, file]
         if not good:
             continue
-        base = groups.get((scene, ranks, rtol, found.base), {})
+        base = ended.get((scene, ranks, rtol, found.base), {})
         mine = {k: seconds_of(r, found.clock) for k, r in good.items()}
-        theirs = {k: seconds_of(base[k], found.clock) for k in mine if k in base and base[k]["kind"] in ENDED}
+        theirs = {k: seconds_of(base[k], found.clock) for k in mine if k in base}
+        ratios = {what: [mine[k][what] / s[what] for k, s in theirs.items()] for what in ("setup", *SECONDS)}
         errors = [r["forward_error"] for r in good.values() if r["forward_error"] is not None]
-        rows.append(
-            Point(
-                scene=labels[scene],
-                file=file,
-                ranks=ranks,
-                rtol=rtol,
-                ended=len(good) == len(runs),
-                converged=all(r["kind"] == "converged" for r in runs.values()),
-                iterations=float(np.median([r["iterations"] for r in good.values()])),
-                error=float(np.median(errors)) if errors else float("nan"),
-                residual=float(np.median([r["true_residual"] for r in good.values()])),
-                seconds={what: Spread.of([s[what] for s in mine.values()]) for what in ("read", "setup", *SECONDS)},
-                ratios={
-                    what: Spread.of([mine[k][what] / s[what] for k, s in theirs.items()])
-                    for what in ("setup", *SECONDS)
-                    if theirs
-                },
-                memory=float(np.median([grown(r) for r in good.values()])),
-            )
+        point = Point(
+            *(labels[scene], file, ranks, rtol),
+            ended=len(good) == len(runs),
+            converged=all(r["kind"] == "converged" for r in runs.values()),
+            iterations=median(r["iterations"] for r in good.values()),
+            error=median(errors) if errors else float("nan"),
+            residual=median(r["true_residual"] for r in good.values()),
+            seconds={what: Spread.of([s[what] for s in mine.values()]) for what in ("setup", *SECONDS)},
+            ratios={what: Spread.of(values) for what, values in ratios.items() if values},
+            memory=median(map(grown, good.values())),
         )
+        rows.append(point)
     return rows
 
 
 @dataclass(frozen=True)
 class Fastest:
-    """The fastest file for an accuracy."""
+    """The fastest file for an accuracy, and other files whose quartiles overlap with its own, from the fastest."""
 
     file: str
     seconds: float  # median of its fastest point whose error is not above the accuracy
-    ties: tuple[str, ...]  # other files whose quartiles overlap with its own, from the fastest
+    ties: tuple[str, ...]
 
     def __str__(self) -> str:
         ties = f" (≈ {', '.join(self.ties)})" if self.ties else ""
@@ -207,21 +193,17 @@ class Fastest:
 def fastest(found: Iterable[Point], accuracy: float, what: str) -> Fastest | None:
     """The fastest file whose forward error is at most `accuracy`, or None if no file gets there.
 
-    Args:
-        found: points of one scene and number of ranks; those that did not end in every round do not count.
-        accuracy: forward error.
-        what: of `SECONDS`, what counts.
+    Of points of one scene and number of ranks; those that did not end in every round do not count, and of `SECONDS`
+    does `what`.
     """
-    best: dict[str, Spread] = {}
-    for point in found:
-        if point.ended and point.error <= accuracy:
-            spread = point.seconds[what]
-            if point.file not in best or spread.median < best[point.file].median:
-                best[point.file] = spread
+    good = [(p.seconds[what], p.file) for p in found if p.ended and p.error <= accuracy]
+    good.sort(key=lambda pair: pair[0].median)
+    best = {file: spread for spread, file in reversed(good)}  # of each file the first one
     if not best:
         return None
-    (file, first), *others = sorted(best.items(), key=lambda item: item[1].median)
-    return Fastest(file, first.median, tuple(label for label, spread in others if spread.low <= first.high))
+    first, file = good[0]
+    ties = dict.fromkeys(label for _, label in good if label != file and best[label].low <= first.high)
+    return Fastest(file, first.median, tuple(ties))
 
 
 def summary(found: Comparison, everything: Sequence[Point]) -> list[list[object]]:
@@ -240,19 +222,9 @@ def summary(found: Comparison, everything: Sequence[Point]) -> list[list[object]
 
 
 SUMMARY = ("scene", "ranks", "error ≤", *SECONDS.values())
-MEDIANS = "file,ranks,tolerance,iterations,true residual,forward error,set-up (s),solve (s),".split(",")
-RATIOS = (
-    "scene",
-    "ranks",
-    "file",
-    "Krylov",
-    "set-up, s",
-    "solve, s",
-    "set-up ratio",
-    "solve ratio",
-    "ratio",
-    "MiB",
-)
+MEDIANS = "file;ranks;tolerance;iterations;true residual;forward error;set-up (s);solve (s);".split(";")
+RATIOS = "scene;ranks;file;Krylov;set-up, s;solve, s;set-up ratio;solve ratio;ratio;MiB".split(";")
+FAILURES = "scene;file;ranks;outcome;runs;said".split(";")
 
 
 def ratio_rows(found: Comparison, everything: Sequence[Point]) -> list[list[object]]:
@@ -270,7 +242,7 @@ def ratio_rows(found: Comparison, everything: Sequence[Point]) -> list[list[obje
         rows.append([scene, p.ranks, file, f"{p.iterations:g}", *seconds, *ratios, f"{p.memory / 2**20:.3g}"])
     for (ranks, file), values in sorted(means.items()):
         if file != found.base:
-            mean = f"{np.exp(np.mean(np.log(values))):.2f}, worst {max(values):.2f}"
+            mean = f"{geometric_mean(values):.2f}, worst {max(values):.2f}"
             rows.append(["geometric mean", ranks, file, *[""] * 5, mean, ""])
     return rows
 
@@ -285,11 +257,7 @@ def failures(found: Comparison) -> list[list[object]]:
 
 
 def rtols_of(text: str) -> tuple[float, ...]:
-    """Tolerances from "1e-2..1e-12" (every decade), "1e-2..1e-12:2" (every second), or "1e-3,1e-6".
-
-    Raises:
-        UsageError: it cannot be read, or a tolerance is not between 0 and 1.
-    """
+    """Tolerances from "1e-2..1e-12" (every decade), "1e-2..1e-12:2" (every second), or "1e-3,1e-6"; or a UsageError."""
     match = re.fullmatch(r"([^.,:]+(?:\.\d+)?(?:e-?\d+)?)\.\.([^:,]+?)(?::(\d+))?", text)
     try:
         if match is not None:
@@ -310,12 +278,12 @@ def to_csv(found: Comparison) -> str:
     """One line for each record; phases, fields and ranks in columns of their own."""
     rows = []
     for record in found.records:
-        row = {k: v for k, v in record.items() if not isinstance(v, dict | list)}
-        for name, values in record.items():
-            if isinstance(values, dict):
-                row |= {f"{name.removesuffix('_by_field')}_{key}": value for key, value in values.items()}
-            elif isinstance(values, list):
-                row[f"{name}_max"] = max(values)
+        row: Record = {}
+        for name, value in record.items():
+            if isinstance(value, dict):
+                row |= {f"{name.removesuffix('_by_field')}_{key}": v for key, v in value.items()}
+            else:
+                row |= {f"{name}_max": max(value)} if isinstance(value, list) else {name: value}
         rows.append(row | {"scene": Path(record["scene"]).stem})
     first = ["scene", "ranks", "variant", "round", "rtol", "kind", "iterations"]
     text = io.StringIO()
@@ -349,61 +317,54 @@ not decide."""
 
 def page(found: Comparison, everything: Sequence[Point], pictures: Mapping[str, Path]) -> str:
     """The page: summary, pictures by label of the scene, and how it was measured; it refers to no other file."""
-    import base64
-    import html
-
-    from petsc_fs.tools.pages import hypertext
-
-    title = f"Comparison: {', '.join(case.label for case in found.cases)}"
+    title = escape(f"Comparison: {', '.join(case.label for case in found.cases)}")
     lines = [
-        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>',
-        f"<style>{STYLE}</style></head><body><h1>{html.escape(title)}</h1>",
+        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>',
+        f"<style>{STYLE}</style></head><body><h1>{title}</h1>",
     ]
     if not found.about["complete"]:
         lines.append("<p><b>Measuring was interrupted:</b> later rounds or combinations are missing.</p>")
     if found.base:
-        lines += [f"<h2>Against {html.escape(found.base)}</h2>", hypertext(RATIOS, ratio_rows(found, everything))]
-    best = summary(found, everything)
-    if best:
+        lines += [f"<h2>Against {escape(found.base)}</h2>", hypertext(RATIOS, ratio_rows(found, everything))]
+    if best := summary(found, everything):
         lines += ["<h2>Which file is fastest for which accuracy</h2>", hypertext(SUMMARY, best)]
     for case in found.cases:
-        sizes = ", ".join(f"{name} {size:,}" for name, size in case.sizes.items())
-        steps = f"{case.steps} steps; " if case.steps else ""
-        about = f"{case.model}, {case.dimension}D; {steps}{sum(case.sizes.values()):,} unknowns: {sizes}."
-        lines += [
-            f"<h2>{html.escape(case.label)}</h2>",
-            f"<p>{html.escape(about)}</p>",
-        ]
-        if case.label in pictures:
-            data = base64.b64encode(pictures[case.label].read_bytes()).decode("ascii")
-            lines.append(f'<img alt="Error against seconds" src="data:image/svg+xml;base64,{data}">')
-        if case.reference:
-            words = f"{case.reference['method']}; last correction {case.reference['corrections'][-1]:.0e}, "
-            words += f"componentwise backward error {case.reference['backward_error']['componentwise']:.0e}"
-            lines.append(f"<p>Reference: {html.escape(words)}.</p>")
-        rows = [
-            (
-                *(p.file, p.ranks, "its own" if p.rtol is None else f"{p.rtol:.0e}", f"{p.iterations:g}"),
-                *(f"{p.residual:.1e}", f"{p.error:.1e}", p.seconds["setup"], p.seconds["solve"]),
-                "" if p.converged else "missed the tolerance" if p.ended else "failed in some rounds",
-            )
-            for p in everything
-            if p.scene == case.label
-        ]
-        lines.append(f"<details><summary>All medians</summary>{hypertext(MEDIANS, rows)}</details>")
+        lines += _about_case(case, [p for p in everything if p.scene == case.label], pictures.get(case.label))
     failed = failures(found)
     lines.append("<h2>What did not converge</h2>")
-    heads = ("scene", "file", "ranks", "outcome", "runs", "said")
-    lines.append(hypertext(heads, failed) if failed else "<p>Every solve met its tolerance.</p>")
+    lines.append(hypertext(FAILURES, failed) if failed else "<p>Every solve met its tolerance.</p>")
     facts = [[k, f"{v:.3g}" if isinstance(v, float) else v] for k, v in found.about.items()]
     facts.append(["seconds are", f"{CLOCKS[found.clock]} of the slowest rank"])
     lines += ["<h2>How this was measured</h2>", f"<p>{METHOD}</p>", hypertext(("", ""), facts)]
     for variant in found.variants:
         more = "".join(f"-{k} {v or ''}\n" for k, v in variant.options.items())
-        head = f"<code>{html.escape(variant.label)}</code>: {html.escape(variant.purpose)}"
-        text = html.escape(more + variant.text)
-        lines.append(f"<details><summary>{head}</summary><pre>{text}</pre></details>")
+        head = f"<code>{escape(variant.label)}</code>: {escape(variant.purpose)}"
+        lines.append(f"<details><summary>{head}</summary><pre>{escape(more + variant.text)}</pre></details>")
     return "\n".join([*lines, "</body></html>"]) + "\n"
+
+
+def _about_case(case: Case, mine: Sequence[Point], picture: Path | None) -> Iterator[str]:
+    """The part of the page on one scene."""
+    sizes = ", ".join(f"{name} {size:,}" for name, size in case.sizes.items())
+    steps = f"{case.steps} steps; " if case.steps else ""
+    about = f"{case.model}, {case.dimension}D; {steps}{sum(case.sizes.values()):,} unknowns: {sizes}."
+    yield from (f"<h2>{escape(case.label)}</h2>", f"<p>{escape(about)}</p>")
+    if picture is not None:
+        data = base64.b64encode(picture.read_bytes()).decode("ascii")
+        yield f'<img alt="Error against seconds" src="data:image/svg+xml;base64,{data}">'
+    if case.reference:
+        words = f"{case.reference['method']}; last correction {case.reference['corrections'][-1]:.0e}, "
+        words += f"componentwise backward error {case.reference['backward_error']['componentwise']:.0e}"
+        yield f"<p>Reference: {escape(words)}.</p>"
+    rows = [
+        (
+            *(p.file, p.ranks, "its own" if p.rtol is None else f"{p.rtol:.0e}", f"{p.iterations:g}"),
+            *(f"{p.residual:.1e}", f"{p.error:.1e}", p.seconds["setup"], p.seconds["solve"]),
+            "" if p.converged else "missed the tolerance" if p.ended else "failed in some rounds",
+        )
+        for p in mine
+    ]
+    yield f"<details><summary>All medians</summary>{hypertext(MEDIANS, rows)}</details>"
 
 
 def draw(found: Comparison, everything: Sequence[Point], out: Path) -> dict[str, Path]:
@@ -414,13 +375,11 @@ def draw(found: Comparison, everything: Sequence[Point], out: Path) -> dict[str,
     ranks = min(found.ranks)
     for case in found.cases:
         mine = [p for p in everything if p.scene == case.label and p.ranks == ranks and p.error == p.error]
-        if not mine:
-            continue
         curves: dict[str, dict[str, list[tuple[float, float]]]] = {heading: {} for heading in SECONDS.values()}
         for (what, heading), p in itertools.product(SECONDS.items(), mine):
             curves[heading].setdefault(p.file, []).append((p.seconds[what].median, p.error))
         where = f"{case.label} on {ranks} rank{'s' if ranks > 1 else ''}"
-        for suffix in ("png", "svg"):
+        for suffix in ("png", "svg") if mine else ():
             target = out / f"work_precision_{case.label}.{suffix}"
             pictures[case.label] = plot_work_precision(curves, target, where, CLOCKS[found.clock])
     return pictures
@@ -438,7 +397,7 @@ Single-dash options are PETSc's and go to every run (-n RANKS is the exception).
 
   petsc-fs compare model1.h5 model2.h5 --repeat 3 --out comparison
   petsc-fs compare mine.h5 --options direct.opts "mine.opts -ksp_max_it 50" \\
-      --rtol 1e-2..1e-10:2 -n 1 2 --out comparison
+      --rtol 1e-2..1e-10:2 --ranks 1 2 --out comparison
   petsc-fs compare mine.h5 run.h5 --options mine.opts --repeat 5 \\
       --base contact_poromechanics.opts
   petsc-fs compare --again comparison/compare.json --out comparison
@@ -455,16 +414,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--base", metavar="FILE", help="options file whose seconds the others' are set against, in the same round")
     add("--rtol", metavar="A..B", help=f"tolerances, every decade, or a list with commas; default {RTOLS}, and with "
         "--base those of the files, without errors")  # fmt: skip
-    add("--ranks", type=int, nargs="+", metavar="N", help="numbers of ranks; default 1")
-    add("--repeat", type=int, default=5, metavar="N", help="rounds, default %(default)s")
+    add("--ranks", type=positive(int), nargs="+", metavar="N", help="numbers of ranks; default 1")
+    add("--repeat", type=positive(int), default=5, metavar="N", help="rounds, default %(default)s")
     add("--out", type=Path, metavar="DIR", help="folder to write, made if missing; with --base it may be left away")
-    add(
-        "--time-limit",
-        type=float,
-        default=300.0,
-        metavar="S",
-        help="seconds for a set-up or solve, default %(default)g",
-    )
+    add("--time-limit", type=positive(float), default=300.0, metavar="S", help="seconds for a set-up or solve, default "
+        "%(default)g")  # fmt: skip
     add("--clock", choices=CLOCKS, help="what seconds are; cpu: processor time, for a machine where others compute")
     add("--mpiexec", metavar="PROGRAM", help="that starts ranks; default MPIEXEC or the one on PATH")
     add("--again", type=Path, metavar="FILE.json", help="draw from an earlier comparison instead")
@@ -474,7 +428,7 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
     """Run `petsc-fs compare`."""
     if comm.size > 1:
         raise UsageError("compare starts mpiexec itself: call it without, and give it -n RANKS")
-    if args.out is None and not args.base:
+    if args.out is None and (args.again or not args.base):
         raise UsageError("--out: name the folder to write")
     if args.out is not None:
         from petsc_fs.tools.plots import pyplot
@@ -485,7 +439,7 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
             found = Comparison.from_json(args.again.read_text(encoding="utf-8"))
         except (OSError, ValueError, TypeError, KeyError) as e:
             raise UsageError(f"--again {args.again}: not a comparison: {e}") from e
-        _make_folder(args.out)
+        measure.make_folder(args.out)
     else:
         found = _measure(args, petsc)
     if args.clock is not None:
@@ -493,8 +447,7 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
     everything = points(found)
     if found.base:
         _print(RATIOS, ratio_rows(found, everything))
-    best = summary(found, everything)
-    if best:
+    if best := summary(found, everything):
         _print(SUMMARY, best)
     if args.out is not None:
         pictures = draw(found, everything, args.out)
@@ -510,93 +463,61 @@ def _measure(args: argparse.Namespace, petsc: list[str]) -> Comparison:
     from petsc_fs.io.bundled import find_scene
     from petsc_fs.tools import reference
 
-    more_ranks, more = split_ranks(petsc)
+    more_ranks, more = measure.split_ranks(petsc)
     ranks = tuple(dict.fromkeys(args.ranks or more_ranks or [1]))
     rtols = () if args.base and not args.rtol else rtols_of(args.rtol or RTOLS)
     if not args.scenes:
         raise UsageError("name at least one scene; they come before --options")
-    if min(ranks) < 1 or args.repeat < 1 or args.time_limit <= 0:
-        raise UsageError("--ranks, --repeat and --time-limit must be positive")
     cases = [Case.of(path) for path in dict.fromkeys(find_scene(name) for name in args.scenes)]
     variants = _variants(args.options, args.base, cases, more)
-    _unique("scenes", [case.label for case in cases])
-    _unique("options files", [variant.label for variant in variants])
+    measure.refuse_twice("scenes", [case.label for case in cases])
     if args.out is not None:
-        _make_folder(args.out)
-    started, complete, records = time.time(), True, list[Record]()
-    references: dict[str, str] = {}
+        measure.make_folder(args.out)  # once nothing in the call is found wrong any more
+    started, complete, records, references = time.time(), True, list[Record](), dict[str, str]()
     by_path = {case.path: case for case in cases}
+
+    def fits(system: str, variant: Variant) -> bool:
+        return variant.fits(tuple(by_path[system].sizes), by_path[system].names)
+
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # batch systems send it when time is up
     try:
         for k, case in enumerate(cases if rtols and args.out is not None else ()):
             if not case.steps:
-                _say(f"reference solution of {case.label}")
+                say(f"reference solution of {case.label}")
                 references[case.path] = os.fspath(args.out / f"reference_{case.label}.npz")
                 cases[k] = replace(case, reference=reference.made(case.path, Path(references[case.path])).about())
-        for found in measure_all(
-            list(by_path),
-            variants,
-            Job(rtols=rtols, warm_up=True, errors=True, references=references, time_limit=args.time_limit),
-            ranks=ranks,
-            repeat=args.repeat,
-            fits=lambda system, variant: variant.fits(tuple(by_path[system].sizes), by_path[system].names),
-            mpiexec=args.mpiexec,
-        ):
+        how: dict[str, Any] = {"time_limit": args.time_limit, "mpiexec": args.mpiexec, "warm_up": True, "errors": True}
+        job = Job(rtols=rtols, references=references, **how)
+        for found in measure.measure_all(list(by_path), variants, job, ranks=ranks, repeat=args.repeat, fits=fits):
             records += found
             for r in (r for r in found if r["kind"] != "converged"):
                 where = f"{by_path[r['scene']].label}, {r['variant']}, {r['ranks']} rank(s)"
-                _say(f"{where}: {r['kind']} {r['message'] or r['reason']}")
+                say(f"{where}: {r['kind']} {r['message'] or r['reason']}")
     except KeyboardInterrupt:
         if not records:
             raise
         complete = False
     finally:
         signal.signal(signal.SIGTERM, before)
-    about = {
-        "command": " ".join(["petsc-fs", *sys.argv[1:]]),
-        "date": time.strftime("%Y-%m-%d %H:%M", time.localtime(started)),
-        "minutes": (time.time() - started) / 60,
-        "complete": complete,
-        "load average at the end": os.getloadavg()[2],
-        **describe_machine(),
-    }
-    how = {"clock": args.clock or "wall", "base": variants[0].label if args.base else ""}
-    return Comparison(tuple(cases), tuple(variants), ranks, rtols, args.repeat, records, about, **how)
+    date = time.strftime("%Y-%m-%d %H:%M", time.localtime(started))
+    about = {"command": " ".join(["petsc-fs", *sys.argv[1:]]), "date": date, "minutes": (time.time() - started) / 60}
+    about |= {"complete": complete, "load average at the end": os.getloadavg()[2], **measure.describe_machine()}
+    clock, base = args.clock or "wall", variants[0].label if args.base else ""
+    return Comparison(tuple(cases), tuple(variants), ranks, rtols, args.repeat, records, about, clock, base)
 
 
 def _variants(
     names: Sequence[str] | None, base: str | None, cases: Sequence[Case], more: Mapping[str, str | None]
 ) -> list[Variant]:
-    """Options files by path or name of a shipped one, the base first.
-
-    Raises:
-        UsageError: a file is missing or wrong, or one is for none of the scenes.
-    """
+    """Options files by path or name of a shipped one, the base first; those named must be for one of the scenes."""
     words = names or [str(file.path) for file in options.shipped()]
-    found = list({v.label: v for v in (Variant.of(w, more) for w in ([base, *words] if base else words))}.values())
-    fitting = [v for v in found if any(v.fits(tuple(c.sizes), c.names) for c in cases)]
-    if names and len(fitting) < len(found):
-        wrong = next(v for v in found if v not in fitting)
-        raise UsageError(f"{wrong.path} is for none of the scenes, by its header")
-    return fitting
-
-
-def _unique(what: str, labels: Sequence[str]) -> None:
-    twice = next((label for label in labels if labels.count(label) > 1), None)
-    if twice is not None:
-        raise UsageError(f"two {what} are called {twice}: rename one, as tables tell them apart by name")
-
-
-def _make_folder(folder: Path) -> None:
-    """Make the folder of --out, once nothing in the call is found wrong any more."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as e:
-        raise UsageError(f"--out {folder}: cannot be made: {e.strerror}") from e
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
+    found = {v.label: v for v in (Variant.of(w, more) for w in ([base, *words] if base else words))}
+    for label, v in list(found.items()):
+        if not any(v.fits(tuple(c.sizes), c.names) for c in cases):
+            if names:
+                raise UsageError(f"{v.path} is for none of the scenes, by its header")
+            del found[label]
+    return list(found.values())
 
 
 def _print(headings: Sequence[str], rows: Sequence[Sequence[object]]) -> None:

@@ -71,13 +71,20 @@ FORMULAS = {
 }
 """Terms on the right-hand side of eq:convergence_condition."""
 
+VIOLATIONS = {
+    "sticking_slip_m": "slip of sticking cells, m",
+    "sticking_slip_over_bound": "c slip / friction bound",
+    "coulomb_mismatch_pa": "Coulomb mismatch eps, Pa",
+    "coulomb_mismatch_over_trial": "eps / |y|",
+}
+"""What the theorem assumes to vanish, by name and in words."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ContactRows:
     """The numbers in the linearised contact conditions, per fracture cell, in the units of the scene.
 
-    NaN stands where a number does not belong to the state of a cell. A cell that neither sticks nor slides is free
-    tangentially.
+    NaN stands where one does not belong to the state of a cell; what neither sticks nor slides is free tangentially.
     """
 
     closed: Mask
@@ -102,11 +109,8 @@ class Contraction:
     theorem: dict[str, float] = field(default_factory=dict)  # the same with extrema over cells as the theorem has them
     stiffness: tuple[float, float] | None = None  # lower and upper bound of 4 G D in Pa/m
     rate: float | None = None  # contraction factor q that the theorem promises
-    slip: Floats = field(default_factory=lambda: np.zeros(0))  # of sticking cells in m
-    slip_over_bound: Floats = field(default_factory=lambda: np.zeros(0))  # times c / b
-    mismatch: Floats = field(default_factory=lambda: np.zeros(0))  # epsilon of sliding cells in Pa
-    mismatch_over_trial: Floats = field(default_factory=lambda: np.zeros(0))  # over |y|
-    friction: Floats = field(default_factory=lambda: np.zeros(0))  # Coulomb coefficient as far as rows hold it
+    violations: dict[str, Floats] = field(default_factory=dict)  # per name in VIOLATIONS; empty without contact rows
+    friction: Floats | None = None  # Coulomb coefficient as far as rows hold it
     centers: Floats | None = None  # (fracture cells, 3) in m
     notes: tuple[str, ...] = ()  # assumptions that the scene does not meet, and what could not be evaluated, in words
 
@@ -149,47 +153,32 @@ class Contraction:
             "right_hand_side": self.demand,
             "rate": self.rate,
             "terms": {
-                name: {"formula": FORMULAS[name], "theorem": self.theorem[name], **self._summary(values)}
+                name: {"formula": FORMULAS[name], "theorem": self.theorem[name], **self.summary(values)}
                 for name, values in self.terms.items()
             },
-            "violations": {
-                "sticking_slip_m": self._summary(self.slip),
-                "sticking_slip_over_bound": self._summary(self.slip_over_bound),
-                "coulomb_mismatch_pa": self._summary(self.mismatch),
-                "coulomb_mismatch_over_trial": self._summary(self.mismatch_over_trial),
-            },
-            "friction_coefficient": self._summary(self.friction),
+            "violations": {name: self.summary(self.violations.get(name)) for name in VIOLATIONS},
+            "friction_coefficient": self.summary(self.friction),
             "notes": self.notes,
         }
-        return json.dumps(_finite(data), indent=2, allow_nan=False) + "\n"
+        strict = json.loads(json.dumps(data), parse_constant=lambda name: None)
+        return json.dumps(strict, indent=2) + "\n"
 
-    def _summary(self, values: Floats) -> dict[str, Any]:
-        found = summary(values)
-        if found is None:
+    def summary(self, values: Floats | None) -> dict[str, Any]:
+        """Number of cells that have a value; least, median and greatest one, cell and place of the greatest."""
+        known = np.zeros(0) if values is None else values[~np.isnan(values)]
+        if values is None or not known.size:
             return {"cells": 0}
-        least, median, greatest, cell = found
+        cell = int(np.nanargmax(values))
         at = None if self.centers is None else self.centers[cell].tolist()
-        count = int(np.count_nonzero(~np.isnan(values)))
-        return {"cells": count, "min": least, "median": median, "max": greatest, "max_cell": cell, "max_at_m": at}
-
-
-def summary(values: Floats) -> tuple[float, float, float, int] | None:
-    """Least, median and greatest value, and the cell of the greatest; NaN is left out, None if all are."""
-    if not values.size or np.isnan(values).all():
-        return None
-    return float(np.nanmin(values)), float(np.nanmedian(values)), float(np.nanmax(values)), int(np.nanargmax(values))
+        spread = {"min": float(known.min()), "median": float(np.median(known)), "max": float(known.max())}
+        return {"cells": known.size, **spread, "max_cell": cell, "max_at_m": at}
 
 
 def evaluate(scene: Scene) -> Contraction:
     """The terms of the theorem's condition, and how far the scene is from its assumptions.
 
     Local, for whole scenes. What the scene cannot tell is missing from the result, and named in its notes.
-
-    Raises:
-        SceneError: the scene is the part of one rank.
     """
-    if scene.rows is not None:
-        raise SceneError("contraction: needs a whole scene, this is the part of one rank")
     notes = _geometry_notes(scene)
     length, stress = _units(scene)
     contact = bool(scene.sizes.get("contact"))
@@ -197,45 +186,37 @@ def evaluate(scene: Scene) -> Contraction:
     terms: dict[str, Floats] = {}
     facts: dict[str, Any] = {}
 
-    def known(what: str, compute: Callable[[], Value]) -> Value | None:
+    def known(what: str, compute: Callable[..., Value], *given: Any) -> Value | None:
         try:
-            return compute()
+            return compute(scene, *given)
         except SceneError as e:
             notes.append(f"{what} not evaluated: {e}")
             return None
 
-    rows = known("contact terms", lambda: contact_rows(scene)) if contact else None
+    rows = known("contact terms", contact_rows) if contact else None
     if rows is not None:
         notes += _contact_notes(rows)
         terms, theorem = contact_terms(rows)
-        facts = {
-            "slip": rows.slip * length,
-            "slip_over_bound": rows.slip * rows.constant / rows.bound,
-            "mismatch": rows.mismatch * stress,
-            "mismatch_over_trial": rows.mismatch / rows.trial,
-            "friction": rows.friction,
-        }
+        relative = rows.slip * rows.constant / rows.bound, rows.mismatch / rows.trial
+        violations = rows.slip * length, relative[0], rows.mismatch * stress, relative[1]
+        facts = {"violations": dict(zip(VIOLATIONS, violations, strict=True)), "friction": rows.friction}
     stiffness = rate = None
     if scene.material is None:
         notes.append("coupling term, 4 G D and rate not evaluated: the scene has no material data")
     else:
-        rate = known("rate", lambda: contraction_rate(scene))
-        coupling = known("coupling term", lambda: coupling_term(scene)) if contact else None
+        rate = known("rate", contraction_rate)
+        coupling = known("coupling term", coupling_term) if contact else None
         if coupling is not None:
             terms, theorem = {"coupling": coupling, **terms}, {"coupling": float(np.max(coupling)), **theorem}
         if rows is not None:
-            stiffness = known("4 G D", lambda: korn_trace(scene, rows))
+            stiffness = known("4 G D", korn_trace, rows)
     scale = stress / length
-    centers = scene.cell_centers.get("contact")
-    return Contraction(
-        terms={name: values * scale for name, values in terms.items()},
-        theorem={name: value * scale for name, value in theorem.items()},
-        stiffness=None if stiffness is None else (stiffness[0] * scale, stiffness[1] * scale),
-        rate=rate,
-        centers=None if centers is None else centers * length,
-        notes=tuple(notes),
-        **facts,
-    )
+    if "contact" in scene.cell_centers:
+        facts["centers"] = scene.cell_centers["contact"] * length
+    if stiffness is not None:
+        facts["stiffness"] = (stiffness[0] * scale, stiffness[1] * scale)
+    facts |= {"terms": {name: values * scale for name, values in terms.items()}, "rate": rate, "notes": tuple(notes)}
+    return Contraction(theorem={name: value * scale for name, value in theorem.items()}, **facts)
 
 
 def contact_rows(scene: Scene) -> ContactRows:
@@ -245,7 +226,7 @@ def contact_rows(scene: Scene) -> ContactRows:
         SceneError: there is no contact, cell volumes are missing, or the rows are not of this kind: the
             two walls of a fracture cell must each be one interface cell, as on matching grids.
     """
-    if "contact" not in scene.sizes or "intf_force" not in scene.sizes:
+    if not {"contact", "intf_force"} <= set(scene.sizes):
         raise SceneError("the scene has no contact")
     if "contact" not in scene.cell_volumes:
         raise SceneError("the scene has no areas of the fracture cells (cell_volumes of contact)")
@@ -271,15 +252,14 @@ def contact_rows(scene: Scene) -> ContactRows:
     if constants.size and not (constant > 0 and np.allclose(constants, constant, rtol=1e-6)):
         raise SceneError("the normal contact conditions have not one and the same positive constant c")
 
-    nan = np.full(cells, np.nan)
-    beta_b, slip, bound, trial, mismatch, friction = (nan.copy() for _ in range(6))
-    beta_b[closed] = np.maximum(-D[closed, 0, 0] / C[closed, 0, 0], 0)
+    values = {name: np.full(cells, np.nan) for name in "beta_b slip bound trial mismatch friction".split()}
+    values["beta_b"][closed] = np.maximum(-D[closed, 0, 0] / C[closed, 0, 0], 0)
     # c d(lambda) / d(t) is a number, as t = lambda / unit: with c per length, tractions come in units of `unit`.
-    at = sticking
+    at, slip = sticking, values["slip"]
     slip[at] = np.linalg.norm(r[at, 1:], axis=1) / np.abs(slope[at])
-    bound[at] = slope[at] / constant * unit
+    values["bound"][at] = slope[at] / constant * unit
     moving = at & (slip * constant > SLIP * np.abs(slope) / constant)
-    friction[moving] = unit * np.linalg.norm(D[moving, 1:, 0], axis=1) / (constant * slip[moving])
+    values["friction"][moving] = unit * np.linalg.norm(D[moving, 1:, 0], axis=1) / (constant * slip[moving])
     at = sliding
     Dt, Ct = D[at, 1:, 1:] * unit, C[at, 1:, 1:]
     # C_tt / c - D_tt = |y| I, whatever lambda_tau is.
@@ -288,23 +268,11 @@ def contact_rows(scene: Scene) -> ContactRows:
     push = np.linalg.norm(direction, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         along = direction / push[:, None]
-        friction[at] = push / size_y
-    trial[at] = size_y * unit
-    mismatch[at] = -np.einsum("ni,nij,nj->n", along, Ct, along) / constant * unit
-    return ContactRows(
-        closed=closed,
-        sticking=sticking,
-        sliding=sliding,
-        area=area,
-        constant=constant * unit,
-        beta_b=beta_b,
-        slip=slip,
-        bound=bound,
-        trial=trial,
-        mismatch=mismatch,
-        friction=friction,
-        jump=jump,
-    )
+        values["friction"][at] = push / size_y
+    values["trial"][at] = size_y * unit
+    values["mismatch"][at] = -np.einsum("ni,nij,nj->n", along, Ct, along) / constant * unit
+    kinds = {"closed": closed, "sticking": sticking, "sliding": sliding}
+    return ContactRows(**kinds, **values, area=area, constant=constant * unit, jump=jump)
 
 
 def contact_terms(rows: ContactRows) -> tuple[dict[str, Floats], dict[str, float]]:
@@ -366,10 +334,7 @@ def contraction_rate(scene: Scene) -> float:
     """Factor q = 1 / (lambda beta) = 1 / (1 + lambda / alpha^2 (1/M + c_f phi)); the worst cell of the rock.
 
     It is 0 where alpha is: flow then does not feel the rock. It is that of the scheme with stabilisation
-    alpha^2 / lambda in the rock and gamma_c in fractures.
-
-    Raises:
-        SceneError: material data are missing.
+    alpha^2 / lambda in the rock and gamma_c in fractures. A SceneError where material data are missing.
     """
     data = _rock_data(scene)
     rock = slice(None) if scene.cell_dimension is None else scene.cell_dimension == scene.dimension
@@ -391,10 +356,8 @@ def korn_trace(scene: Scene, rows: ContactRows) -> tuple[float, float]:
         SceneError: there is no momentum balance or material, or the walls can move without force.
     """
     data = _rock_data(scene)
-    if "momentum" not in scene.sizes:
-        raise SceneError("the scene has no momentum balance")
-    if scene.cell_dimension is None:
-        raise SceneError("the scene has no cell_dimension")
+    if "momentum" not in scene.sizes or scene.cell_dimension is None:
+        raise SceneError(f"the scene has no {'cell_dimension' if 'momentum' in scene.sizes else 'momentum balance'}")
     rock = scene.cell_dimension == scene.dimension
     softness = _largest_compliance(scene, rows)
     ratio = scene.dimension * data["lame_lambda"][rock] / (2 * data["shear_modulus"][rock])
@@ -515,21 +478,10 @@ def _geometry_notes(scene: Scene) -> list[str]:
 
 def _contact_notes(rows: ContactRows) -> list[str]:
     notes = []
-    stiff = int(np.count_nonzero(rows.beta_b == 0))
-    if stiff:
+    if stiff := np.count_nonzero(rows.beta_b == 0):
         notes.append(f"closed cells without elastic closure (K_n = 0), which the analysis does not cover: {stiff}")
-    slipping = int(np.count_nonzero(rows.slip > SLIP * rows.bound / rows.constant))
-    if slipping:
+    if slipping := np.count_nonzero(rows.slip > SLIP * rows.bound / rows.constant):
         notes.append(f"sticking cells that have slipped, against assumption:sticking_ut_zero: {slipping}")
     if not rows.closed.any() and (rows.sticking | rows.sliding).any():
         notes.append("no cell is closed, so that the constant c, and with it |y| and epsilon, remain unknown")
     return notes
-
-
-def _finite(value: Any) -> Any:
-    """The same with None for numbers that JSON does not have."""
-    if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value

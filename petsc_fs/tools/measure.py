@@ -35,6 +35,7 @@ Times are the slowest rank's. Where a solve crashes, records of those before it 
 
 from __future__ import annotations
 
+import argparse
 import ctypes
 import itertools
 import json
@@ -82,6 +83,8 @@ CLOCKS = {"wall": "wall clock", "cpu": "processor time"}
 """What seconds can be. Processor time, the busiest rank's, is steadier where other programs run, but hides what waits
 for others."""
 
+HOME = Path(__file__).resolve().parent.parent.parent
+"""Where the package lies."""
 GRACE = 5.0
 """Seconds that mpiexec has to end its ranks before it is killed."""
 POLL = 0.02
@@ -126,15 +129,7 @@ class Job:
     time_limit: float = 300.0  # seconds for each step: start and reading, set-up, one solve, errors
     memory_limit: int | None = None  # bytes of address space that each rank may have
     keep_going: bool = False  # whether the next scene follows after an error that all ranks raised
-
-    def to_json(self) -> str:
-        """What the measured process reads."""
-        return json.dumps(asdict(self), default=os.fspath)
-
-    @classmethod
-    def from_json(cls, text: str) -> Job:
-        """Read what `to_json` wrote."""
-        return cls(**json.loads(text))
+    mpiexec: Path_ | None = None  # program that starts ranks; None for that of `find_mpiexec`
 
 
 @dataclass(frozen=True)
@@ -151,16 +146,12 @@ class Variant:
 
     @classmethod
     def of(cls, words: str, more: Mapping[str, str | None] | None = None) -> Variant:
-        """Read "FILE -option value ...", with further options that all variants have.
-
-        Raises:
-            UsageError: the file is missing, or PETSc would not understand it.
-        """
+        """Read "FILE -option value ...", with further options that all variants have; or raise a UsageError."""
         name, *own = shlex.split(words)
         path = options_files.find_options_file(name)
         options_files.parse(path)
         header = options_files.read_header(path)
-        label, chosen = " ".join([path.stem, *own]), {**(more or {}), **petsc_options(own)}
+        label, chosen = " ".join([path.stem, *own]), {**(more or {}), **options_files.Given.of(own).values}
         text = path.read_text(encoding="utf-8")
         return cls(label, str(path), chosen, header.fields, header.not_for, header.purpose, text)
 
@@ -169,36 +160,45 @@ class Variant:
         return (not self.fields or set(self.fields) == set(fields)) and not set(names) & set(self.not_for)
 
 
-def petsc_options(words: Sequence[str]) -> dict[str, str | None]:
-    """PETSc's options by name, without the dash, from words of a command line."""
-    found: dict[str, list[str]] = {}
-    last = ""
-    for word in words:
-        if re.match(r"-[A-Za-z_]", word):
-            last = word[1:]
-            found[last] = []
-        elif last:
-            found[last].append(word)
-        else:
-            raise UsageError(f"{word!r} is not an option; options start with '-'")
-    return {name: " ".join(values) or None for name, values in found.items()}
-
-
 def split_ranks(petsc: Sequence[str]) -> tuple[list[int], dict[str, str | None]]:
-    """Numbers of ranks from `-n`, and PETSc's other options by name.
+    """The number of ranks that `-n` says, if it is there, and PETSc's other options by name; or a UsageError."""
+    found = options_files.Given.of(petsc).values
+    ranks = [found.pop(name) or "" for name in ("n", "np") if name in found]
+    if not all(number.isdecimal() and int(number) for number in ranks):
+        raise UsageError("-n: expected a number of ranks; --ranks takes several")
+    return [int(number) for number in ranks[-1:]], found
 
-    Raises:
-        UsageError: -n has no number.
-    """
-    found = petsc_options(petsc)
-    ranks: list[int] = []
-    for name in ("n", "np"):
-        if name in found:
-            values = (found.pop(name) or "").split()
-            if not values or not all(v.isdecimal() and int(v) for v in values):
-                raise UsageError(f"-{name}: expected numbers of ranks")
-            ranks = [int(v) for v in values]
-    return ranks, found
+
+def positive(kind: type[int] | type[float]) -> Callable[[str], float]:
+    """A type of arguments for argparse: numbers above zero."""
+
+    def number(text: str) -> float:
+        found = kind(text)
+        if not found > 0:
+            raise argparse.ArgumentTypeError(f"expected a positive number, found {text}")
+        return found
+
+    return number
+
+
+def refuse_twice(what: str, names: Sequence[str]) -> None:
+    """Refuse a call in which a name stands for two things by a UsageError."""
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise UsageError(f"{twice}: named twice; {what} need different names, as tables tell them apart by these")
+
+
+def make_folder(folder: Path) -> None:
+    """Make the folder of --out, or raise a UsageError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise UsageError(f"--out {folder}: cannot be made: {e.strerror}") from e
+
+
+def say(line: str) -> None:
+    """Tell who waits what is going on."""
+    print(line, file=sys.stderr, flush=True)
 
 
 def measure_all(
@@ -210,7 +210,6 @@ def measure_all(
     repeat: int = 1,
     fits: Callable[[str, Variant], bool] = lambda system, variant: True,
     batch: bool = False,
-    mpiexec: Path_ | None = None,
 ) -> Iterator[list[Record]]:
     """Measure all combinations, in turns: each once before any is measured again, the first variant another each time.
 
@@ -224,7 +223,6 @@ def measure_all(
         repeat: rounds.
         fits: whether a variant is to be measured on a system.
         batch: whether a process takes all systems, one after the other, and not one alone.
-        mpiexec: program that starts ranks.
 
     Yields:
         The records of a process, with `variant` (its label), `ranks` and `round` beside what `measure` gives. A
@@ -239,44 +237,32 @@ def measure_all(
             left = [s for s in group if fits(s, v) and (s, v.label, n) not in hung]
             while left:
                 references = {s: job.references[s] for s in left if s in job.references}
-                what: dict[str, Any] = {
-                    "options_file": v.path or None,
-                    "options": v.options,
-                    "ranks": n,
-                    "references": references,
-                }
-                found = measure(replace(job, scenes=left, **what), mpiexec=mpiexec)
+                what = replace(job, scenes=left, ranks=n, references=references)
+                found = measure(replace(what, options_file=v.path or None, options=v.options))
                 hung |= {(r["scene"], v.label, n) for r in found if r["kind"] == "hang"}
                 yield [r | {"variant": v.label, "ranks": n, "round": number} for r in found]
                 done = {r["scene"] for r in found}
                 left = [s for s in left if s not in done]
 
 
-def measure(job: Job, *, mpiexec: Path_ | None = None) -> list[Record]:
-    """Measure in a process of its own and say how it ended.
+def measure(job: Job) -> list[Record]:
+    """Measure in a process of its own and say how it ended: records in the order scene, repetition, tolerance.
 
     Blocks until the process has ended or was ended. Whatever happens in it is in the records; where it did not come
     to its end, the last record says how, for the solve that was under way, and later solves have none. Ctrl-C ends
     the process before it is raised here; where this process is killed, it ends, too (on Linux).
-
-    Args:
-        job: what to measure.
-        mpiexec: program that starts ranks; default `find_mpiexec`.
-
-    Returns:
-        Records in the order scene, repetition, tolerance.
 
     Raises:
         UsageError: there is no mpiexec.
     """
     with tempfile.TemporaryDirectory(prefix="petsc_fs-") as folder:
         events, request, output = (Path(folder) / name for name in ("events", "job.json", "output"))
-        request.write_text(job.to_json(), encoding="utf-8")
+        request.write_text(json.dumps(asdict(job), default=os.fspath), encoding="utf-8")
         events.touch()
         program = [sys.executable, "-m", "petsc_fs.tools.probe", str(request), str(events)]
         with output.open("wb") as sink:
             process = subprocess.Popen(
-                [*launcher(job.ranks, mpiexec), *program],
+                [*launcher(job.ranks, job.mpiexec), *program],
                 stdin=subprocess.DEVNULL,
                 stdout=sink,
                 stderr=subprocess.STDOUT,
@@ -329,11 +315,8 @@ def end(process: subprocess.Popen[bytes]) -> None:
 def _records(job: Job, events: str, code: int | None, said: str) -> list[Record]:
     """Records of a process from its events, and one more where it did not come to its end.
 
-    Args:
-        job: what was asked for.
-        events: a JSON object a line, see `petsc_fs.tools.probe`; the last line may be cut short.
-        code: exit code; None if the process was ended here because time was up.
-        said: all of its output.
+    Events are a JSON object a line, see `petsc_fs.tools.probe`, of which the last may be cut short; the exit code is
+    None if the process was ended here because time was up; and `said` is all of its output.
     """
     found: list[Record] = []
     at: Record = {"phase": "start"}
@@ -379,28 +362,22 @@ def _signal_number(code: int, said: str) -> int:
 
 
 def launcher(ranks: int, mpiexec: Path_ | None = None) -> list[str]:
-    """Command that starts a program on some ranks.
-
-    Raises:
-        UsageError: there is no mpiexec and more than one rank is asked for.
-    """
-    program = find_mpiexec() if mpiexec is None else os.fspath(mpiexec)
-    if program is None:
-        if ranks == 1:
-            return []
+    """Command that starts a program on some ranks; a UsageError where several are asked for and there is no mpiexec."""
+    program = mpiexec or find_mpiexec()
+    if program is None and ranks > 1:
         raise UsageError("no mpiexec on PATH: install one, or name it with MPIEXEC")
-    return [program, "-n", str(ranks)]
+    return [] if program is None else [os.fspath(program), "-n", str(ranks)]
 
 
 def find_mpiexec() -> str | None:
     """`scripts/mpiexec` of a source tree, or what MPIEXEC names, or the one beside Python, or the one on PATH."""
-    script = Path(__file__).resolve().parent.parent.parent / "scripts" / "mpiexec"
-    return str(script) if script.is_file() else os.environ.get("MPIEXEC") or _mpiexec_beside_python()
+    script = HOME / "scripts" / "mpiexec"
+    return str(script) if script.is_file() else os.environ.get("MPIEXEC") or _installed_mpiexec()
 
 
-def _mpiexec_beside_python() -> str | None:
-    beside = Path(sys.base_prefix) / "bin" / "mpiexec"
-    return str(beside) if beside.is_file() else shutil.which("mpiexec")
+def _installed_mpiexec() -> str | None:
+    places = [str(Path(sys.base_prefix) / "bin"), os.environ.get("PATH", os.defpath)]
+    return shutil.which("mpiexec", path=os.pathsep.join(places))
 
 
 def environment() -> dict[str, str]:
@@ -410,9 +387,8 @@ def environment() -> dict[str, str]:
     """
     traces = ("PMIX_", "PMI_", "OMPI_COMM_WORLD_", "OMPI_UNIVERSE_", "OMPI_APP_", "OMPI_FILE_LOCATION", "PRTE_LAUNCHED")
     kept = {name: value for name, value in os.environ.items() if not name.startswith(traces)}
-    here = str(Path(__file__).resolve().parent.parent.parent)
-    paths = [here, *kept.get("PYTHONPATH", "").split(os.pathsep)]
-    defaults = {"OMP_NUM_THREADS": "1", "MPIEXEC": _mpiexec_beside_python() or "mpiexec"}
+    paths = [str(HOME), *kept.get("PYTHONPATH", "").split(os.pathsep)]
+    defaults = {"OMP_NUM_THREADS": "1", "MPIEXEC": _installed_mpiexec() or "mpiexec"}
     return defaults | kept | {"PYTHONPATH": os.pathsep.join(p for p in paths if p)}
 
 

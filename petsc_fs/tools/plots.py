@@ -1,4 +1,8 @@
-"""Pictures of scenes and runs, and matplotlib for all other modules that draw."""
+"""Pictures of scenes, runs and measurements: the one module that draws.
+
+The suffix of a path chooses the format. Each raises a UsageError where matplotlib is missing or the picture cannot be
+written.
+"""
 
 from __future__ import annotations
 
@@ -31,42 +35,29 @@ def pyplot() -> Any:
 
 
 def plot_blocks(scene: Scene, path: str | os.PathLike[str]) -> Path:
-    """Draw the block structure of the Jacobian, and above it what each level eliminates, as the paper does.
+    """Draw the block structure of a whole Jacobian, and above it what each level eliminates, as the paper does.
 
     Above, one small grid per stage: white blocks are empty, light ones those of the Jacobian, dark ones
     changed by the transformation or by a Schur complement, `S` a singular diagonal block. Below, the
     entries of the Jacobian itself.
-
-    Args:
-        scene: with all rows.
-        path: of the picture; its suffix chooses the format.
-
-    Raises:
-        UsageError: matplotlib is missing or does not know the format.
     """
     plt = pyplot()
-    names = scene.fields
-    n = len(names)
-    steps = stages(scene)
+    names, n, steps = scene.fields, len(scene.fields), stages(scene)
     figure = plt.figure(figsize=(max(1.5 * n + 1.8, 2.0 * len(steps)), 1.5 * n + 3.4), layout="constrained")
     grid = figure.add_gridspec(2, len(steps), height_ratios=(1, 4))
     for k, (title, shades) in enumerate(steps):
         small = figure.add_subplot(grid[0, k])
+        _draw_shades(small, names, shades, 0.6)
         for (r, c), shade in shades.items():
-            i, j = names.index(r), names.index(c)
-            small.add_patch(plt.Rectangle((j, i), 1, 1, facecolor=SHADES[shade], edgecolor="#444444", lw=0.6))
             if shade == "singular":
-                small.text(j + 0.5, i + 0.5, "S", ha="center", va="center", fontsize=8)
-        _frame(small, n)
-        small.set_xticks([])
-        small.set_yticks([])
+                small.text(names.index(c) + 0.5, names.index(r) + 0.5, "S", ha="center", va="center", fontsize=8)
+        small.set(xticks=[], yticks=[])
         small.set_title(title, fontsize=9)
     axes = figure.add_subplot(grid[1, :])
-    for (r, c), block in scene.blocks.items():
-        if not block.data.size:
-            continue
+    full = {rc: block for rc, block in scene.blocks.items() if block.data.size}
+    _draw_shades(axes, names, dict.fromkeys(full, "original"), 0.8)
+    for (r, c), block in full.items():
         i, j = names.index(r), names.index(c)
-        axes.add_patch(plt.Rectangle((j, i), 1, 1, facecolor=SHADES["original"], edgecolor="#444444", lw=0.8))
         rows = np.repeat(np.arange(scene.sizes[r]), np.diff(block.indptr))
         x = j + 0.04 + 0.92 * (block.indices + 0.5) / scene.sizes[c]
         y = i + 0.04 + 0.92 * (rows + 0.5) / scene.sizes[r]
@@ -74,15 +65,28 @@ def plot_blocks(scene: Scene, path: str | os.PathLike[str]) -> Path:
         box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.85}
         label = f"$J_{{{FIELD[r].index}{FIELD[c].index}}}$"
         axes.text(j + 0.5, i + 0.5, label, ha="center", va="center", fontsize=11, bbox=box)
-    _frame(axes, n)
     axes.set_xticks(np.arange(n) + 0.5, [f"{f}\n{scene.sizes[f]:,}" for f in names], fontsize=9)
     axes.set_yticks(np.arange(n) + 0.5, names, fontsize=9)
     axes.tick_params(length=0)
     axes.xaxis.tick_top()
-    axes.set_xlabel("unknowns (columns)")
-    axes.set_ylabel("equations (rows)")
+    axes.set(xlabel="unknowns (columns)", ylabel="equations (rows)")
     figure.suptitle(f"{scene.metadata.model or 'scene'}: {sum(scene.sizes.values()):,} unknowns", fontsize=11)
     return _save(figure, Path(path))
+
+
+SHADES = {"original": "#dfe5ec", "singular": "#dfe5ec", "changed": "#7f93a8"}
+
+
+def _draw_shades(axes: Any, names: Sequence[str], shades: Mapping[tuple[str, str], str], width: float) -> None:
+    """A grid of blocks, first row on top."""
+    n = len(names)
+    axes.set(xlim=(0, n), ylim=(n, 0), aspect="equal")
+    for k in range(1, n):
+        axes.axhline(k, color="#bbbbbb", lw=0.4, zorder=0)
+        axes.axvline(k, color="#bbbbbb", lw=0.4, zorder=0)
+    for (r, c), shade in shades.items():
+        place = (names.index(c), names.index(r))
+        axes.add_patch(pyplot().Rectangle(place, 1, 1, facecolor=SHADES[shade], edgecolor="#444444", lw=width))
 
 
 def _save(figure: Any, target: Path) -> Path:
@@ -95,19 +99,6 @@ def _save(figure: Any, target: Path) -> Path:
     finally:
         pyplot().close(figure)
     return target
-
-
-SHADES = {"original": "#dfe5ec", "singular": "#dfe5ec", "changed": "#7f93a8"}
-
-
-def _frame(axes: Any, n: int) -> None:
-    """Axes of an n by n grid of blocks, first row on top."""
-    axes.set_xlim(0, n)
-    axes.set_ylim(n, 0)
-    axes.set_aspect("equal")
-    for k in range(1, n):
-        axes.axhline(k, color="#bbbbbb", lw=0.4, zorder=0)
-        axes.axvline(k, color="#bbbbbb", lw=0.4, zorder=0)
 
 
 def stages(scene: Scene) -> list[tuple[str, dict[tuple[str, str], str]]]:
@@ -160,18 +151,17 @@ def plot_contact_states(
 
     Args:
         records: one per Newton step, with `time_step`, `time` in s, and `contact_states`, name to number of cells.
-        path: of the picture; its suffix chooses the format.
+        path: of the picture.
         title: above the picture.
         cells: centres (n, 3) of the fracture cells in m, and their states as in `Scene.contact_state`.
 
     Raises:
-        UsageError: matplotlib is missing or does not know the format, or no record has contact states.
+        UsageError: see above; or no record has contact states.
     """
     plt = pyplot()
     shown = [record for record in records if record["contact_states"]]
     if not shown:
         raise UsageError(f"{path}: no contact states to draw")
-    steps = np.arange(1, len(shown) + 1)
     figure = plt.figure(figsize=(7.2 if cells is None else 10.2, 3.6), layout="constrained")
     grid = figure.add_gridspec(1, 1 if cells is None else 2, width_ratios=None if cells is None else (2, 1))
     axes = figure.add_subplot(grid[0, 0])
@@ -179,19 +169,19 @@ def plot_contact_states(
         _draw_cells(figure, grid[0, 1], *cells)
     for state, (color, line, marker) in STATES.items():
         counts = [record["contact_states"].get(state, 0) for record in shown]
-        axes.plot(steps, counts, line, color=color, marker=marker, markersize=4, lw=1.6, label=state, clip_on=False)
+        style = {"color": color, "marker": marker, "markersize": 4, "lw": 1.6, "clip_on": False}
+        axes.plot(np.arange(1, len(shown) + 1), counts, line, label=state, **style)
     # A time step that is tried again with a shorter length counts as one more.
     attempts = [(record["time_step"], record["time"]) for record in shown]
     starts = [i for i, attempt in enumerate(attempts) if i == 0 or attempt != attempts[i - 1]]
     ends = [*starts[1:], len(shown)]
     for start, end in list(zip(starts, ends, strict=True))[::2]:
         axes.axvspan(start + 0.5, end + 0.5, color="#ececec", lw=0, zorder=0)
-    axes.set_xlim(0.5, len(shown) + 0.5)
-    axes.set_ylim(0, 1.05 * max(sum(record["contact_states"].values()) for record in shown))
-    axes.xaxis.get_major_locator().set_params(integer=True)
-    axes.yaxis.get_major_locator().set_params(integer=True)
-    axes.set_xlabel("Newton steps from the start (–)")
-    axes.set_ylabel("fracture cells (–)")
+    most = max(sum(record["contact_states"].values()) for record in shown)
+    axes.set(xlim=(0.5, len(shown) + 0.5), ylim=(0, 1.05 * most))
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.get_major_locator().set_params(integer=True)
+    axes.set(xlabel="Newton steps from the start (–)", ylabel="fracture cells (–)")
     times = [shown[start]["time"] for start in starts]
     unit = next(name for name, length in TIME_UNITS.items() if times[-1] >= length or length == 1.0)
     above = axes.secondary_xaxis("top")
@@ -212,15 +202,12 @@ def _draw_cells(figure: Any, place: Any, centers: Floats, states: Integers) -> N
         color, _, marker = STATES[state]
         at = centers[states == number].T / 1000
         axes.scatter(*(at[:2] if flat else at), color=color, marker=marker, s=14)
-    axes.set_aspect("equal")
-    axes.set_xlabel("x (km)")
-    axes.set_ylabel("y (km)")
+    axes.set(aspect="equal", xlabel="x (km)", ylabel="y (km)")
     axes.set_title("at the last Newton step", fontsize=10)
     if not flat:
         axes.set_zlabel("z (km)")
-        for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
-            axis.get_major_locator().set_params(nbins=3)
-        axes.set_box_aspect(axes.get_box_aspect() if hasattr(axes, "get_box_aspect") else None, zoom=0.8)  # room for it
+        axes.locator_params(nbins=3)
+        axes.set_box_aspect(axes.get_box_aspect(), zoom=0.8)  # room for it
 
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -251,9 +238,6 @@ def plot_work_precision(
         path: of the picture.
         title: above it.
         seconds: what they are, for the axes.
-
-    Raises:
-        UsageError: matplotlib is missing, or the picture cannot be written.
     """
     plt = pyplot()
     figure, panels = plt.subplots(1, len(curves), figsize=(9.2, 4.6), sharey=True, squeeze=False, layout="constrained")
@@ -276,11 +260,7 @@ def plot_work_precision(
 def plot_matrix(
     cases: Sequence[Mapping[str, Any]], findings: Sequence[Mapping[str, Any]], outcomes: Sequence[str], path: Path
 ) -> Path:
-    """Draw outcomes: a row for each case under its group, a column for each options file and number of ranks.
-
-    Raises:
-        UsageError: matplotlib is missing, or the picture cannot be written.
-    """
+    """Draw outcomes: a row for each case under its group, a column for each options file and number of ranks."""
     plt = pyplot()
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
@@ -323,21 +303,16 @@ def plot_front(
         names: what the ratios are of.
         title: above the picture.
         path: of it.
-
-    Raises:
-        UsageError: matplotlib is missing, or the picture cannot be written.
     """
-    plt = pyplot()
-    figure, axes = plt.subplots(figsize=(6, 4.6), layout="constrained")
+    figure, axes = pyplot().subplots(figsize=(6, 4.6), layout="constrained")
     for k, (name, points) in enumerate(groups.items()):
         style = look(k) | {"linestyle": "none", "markersize": 4 + 3 * k, "alpha": 0.8}
-        axes.plot([x for x, _ in points], [y for _, y in points], label=f"{name} ({len(points)})", **style)
-    values = [point for points in groups.values() for point in points]
-    for k, scale in enumerate((axes.set_xscale, axes.set_yscale)):
-        if max(v[k] for v in values) > 10 * min(v[k] for v in values):
-            scale("log")
-    axes.set_xlabel(f"{names[0]} / {names[0]} of the base file")
-    axes.set_ylabel(f"{names[1]} / {names[1]} of the base file")
+        axes.plot(*np.reshape(points, (-1, 2)).T, label=f"{name} ({len(points)})", **style)
+    both = zip(*(point for points in groups.values() for point in points), strict=True)
+    for axis, name, values in zip("xy", names, both, strict=True):
+        axes.set(**{f"{axis}label": f"{name} / {name} of the base file"})
+        if max(values) > 10 * min(values):
+            axes.set(**{f"{axis}scale": "log"})
     axes.set_title(title, fontsize=10)
     axes.grid(color="#DDDDDD")
     axes.legend(fontsize=8)

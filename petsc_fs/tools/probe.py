@@ -45,7 +45,7 @@ def main() -> int:
     """Run the job that the command line names. Collective on all ranks."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(DEATH_SIGNAL, signal.SIGKILL)  # no rank outlives mpiexec
-    job = Job.from_json(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    job = Job(**json.loads(Path(sys.argv[1]).read_text(encoding="utf-8")))
     import petsc4py
 
     petsc4py.init(["petsc-fs", "-skip_petscrc", "-options_left", "no"])
@@ -105,10 +105,10 @@ class Probe:
     def __init__(self, job: Job, scene: Path_, comm: MPI.Intracomm, log: Log) -> None:
         self.job, self.path, self.comm, self.log = job, Path(scene), comm, log
         self.rtols: Sequence[float | None] = job.rtols or (None,)
-        self.inserted: list[str] = []
+        self.inserted: tuple[str, ...] = ()
         self.steps: list[tuple[Scene, Layout, float | None]] = []  # with the tolerance that the run had
         self.solver: Solver | None = None
-        self.judge: Judge | None = None  # on rank 0, once there are solutions
+        self.truth: tuple[Scene, Mapping[str, Any] | None] | None = None  # with the reference; on rank 0, once needed
 
     def run(self) -> bool:
         """Measure all repetitions; whether all ended by a verdict. Collective."""
@@ -151,8 +151,9 @@ class Probe:
 
         with together(self.comm):
             steps = sequence.read_contents(self.path).steps if sequence.is_sequence(self.path) else ()
-            self._insert_options(steps[0].sizes if steps else hdf5.read_sizes(self.path)[1])
-        self.given = list(self.inserted)
+            self.inserted = options.insert_all(
+                self._options(steps[0].sizes if steps else hdf5.read_sizes(self.path)[1])
+            )
         self.is_sequence = bool(steps)
         self.steps, self.read_seconds = self._timed(lambda: self._read_steps(steps))
         memory.reset_peak()
@@ -174,19 +175,12 @@ class Probe:
             found.append((scene, layout, None if step is None else step.run.get("forcing")))
         return found
 
-    def _insert_options(self, sizes: Mapping[str, int]) -> None:
-        """Put the job's options into the database, the file's after those that win over it. Local."""
-        if self.job.rtols:
-            self._insert({"ksp_rtol": f"{min(self.job.rtols):g}", "ksp_atol": "0"})
-        self._insert(self.job.options)
-        if self.job.options_file is not None:
-            file = options.find_options_file(os.fspath(self.job.options_file))
-            if not options.read_header(file).fits(sizes):
-                raise UsageError(f"{file.name} is not for the fields {', '.join(sizes)}")
-            self._insert(options.parse(file))
-
-    def _insert(self, values: Mapping[str, str | None]) -> None:
-        self.inserted += options.insert_all(values)
+    def _options(self, sizes: Mapping[str, int]) -> dict[str, str | None]:
+        """The job's options, which win over those of its file. Local."""
+        file, rtols = self.job.options_file, self.job.rtols
+        found = {} if file is None else options.parse(options.fitting_file(os.fspath(file), sizes))
+        exact = {"ksp_rtol": f"{min(rtols):g}", "ksp_atol": "0"} if rtols else {}
+        return {**found, **self.job.options, **exact}
 
     def _repeat(self, repetition: int) -> bool:
         """Set up and solve for each tolerance, step by step; whether all options were used. Collective.
@@ -259,7 +253,7 @@ class Probe:
     def _useless(self) -> str:
         """What to say of options of the job that nothing on any rank asked for; "" if there are none. Collective."""
         idle = set.intersection(*map(set, self.comm.allgather(options.unused())))
-        found = options.refused(sorted(idle & set(self.given)))
+        found = options.refused(sorted(idle & set(self.inserted)))
         if not found:
             return ""
         file = options.find_options_file(os.fspath(self.job.options_file)) if self.job.options_file else None
@@ -268,38 +262,31 @@ class Probe:
     def _compute_errors(self, solved: list[tuple[int, Any]]) -> None:
         """Forward and backward errors of solutions, each with the number of its record. Collective."""
         from petsc_fs.io import hdf5
+        from petsc_fs.tools import reference
 
         self.log.phase("errors")
         with together(self.comm):
-            if self.comm.rank == 0 and self.judge is None:
-                self.judge = Judge(hdf5.read(self.path), self.job.references.get(os.fspath(self.path)))
+            if self.comm.rank == 0 and self.truth is None:
+                file = self.job.references.get(os.fspath(self.path))
+                self.truth = hdf5.read(self.path), None if file is None else reference.read(file).solution
             for number, solution in solved:
-                if solution is not None and self.judge is not None:
-                    self.log.write({"supplement": number, **self.judge.errors(solution)})
+                if solution is not None and self.truth is not None:
+                    self.log.write({"supplement": number, **_errors(*self.truth, solution)})
 
 
 def _sizes(layout: Layout) -> dict[str, int]:
     return {f: layout.sizes(f)[1] for f in layout.fields if layout.sizes(f)[1]}
 
 
-class Judge:
-    """Computes the errors of solutions of one scene, on one rank."""
+def _errors(scene: Scene, exact: Mapping[str, Any] | None, solution: Mapping[str, Any]) -> Record:
+    """Backward errors of a solution, and forward errors where an exact one is known. Local."""
+    from petsc_fs.tools.reference import backward_error, forward_error
 
-    def __init__(self, scene: Scene, reference: Path_ | None) -> None:
-        from petsc_fs.tools import reference as references
-
-        self.scene = scene
-        self.ruler = None if reference is None else references.Ruler(scene, references.read(reference).solution)
-
-    def errors(self, solution: Mapping[str, Any]) -> Record:
-        """Backward errors, and forward errors where there is a reference."""
-        from petsc_fs.tools.reference import backward_error
-
-        found: Record = {"backward_error": backward_error(self.scene, solution)}
-        if self.ruler is not None:
-            total, by_field = self.ruler.errors(solution)
-            found |= {"forward_error": total, "error_by_field": by_field}
-        return found
+    found: Record = {"backward_error": backward_error(scene, solution)}
+    if exact is not None:
+        total, by_field = forward_error(scene, exact, solution)
+        found |= {"forward_error": total, "error_by_field": by_field}
+    return found
 
 
 def verdict(result: Result) -> str:

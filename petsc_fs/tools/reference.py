@@ -29,8 +29,9 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,6 @@ Floats = NDArray[np.float64]
 FieldArrays = Mapping[str, Floats]
 Solve = Callable[[Floats], Floats]
 
-METHODS = ("direct", "iterative", "auto")
 LARGE = {2: 400_000, 3: 40_000}
 """Number of unknowns, by dimension, from which the iterative method is the default."""
 FLUXES = ("intf_flow",)
@@ -72,22 +72,15 @@ POWER_STEPS = 6
 
 @dataclass(frozen=True)
 class Reference:
-    """A solution and what is known of its accuracy.
+    """A solution and what is known of its accuracy."""
 
-    Attributes:
-        solution: all rows of each field, rounded to double precision.
-        method: what it was computed by, in words.
-        corrections: size of each correction relative to the solution, in the worst field; the last one bounds what is
-            wrong with the solution before it is rounded.
-        backward_error: of the rounded solution, see `backward_error`.
-        scene_digest: of the scene's file; "" if there is none.
-    """
-
-    solution: dict[str, Floats]
-    method: str
-    corrections: tuple[float, ...]
-    backward_error: dict[str, float]
-    scene_digest: str = ""
+    solution: dict[str, Floats]  # all rows of each field, rounded to double precision
+    method: str  # what it was computed by, in words
+    corrections: tuple[
+        float, ...
+    ]  # size of each, relative to the solution, in the worst field; the last one is a bound
+    backward_error: dict[str, float]  # of the rounded solution, see `backward_error`
+    scene_digest: str = ""  # of the scene's file; "" if there is none
 
     def about(self) -> dict[str, Any]:
         """Everything but the solution, for JSON."""
@@ -95,35 +88,28 @@ class Reference:
 
 
 def solve(scene: Scene, method: str = "auto", scene_digest: str = "") -> Reference:
-    """Compute a reference solution on this rank alone.
+    """Compute a reference solution of a whole scene on this rank alone. Local.
 
-    Local. The solver's options have the prefix `reference_`.
-
-    Args:
-        scene: with all rows.
-        method: one of `METHODS`; "auto" is "direct" up to the size `LARGE`, and "iterative" beyond, or where the
-            factorisation fails.
-        scene_digest: to be recorded.
+    The method is "direct", "iterative" or "auto": direct up to the size `LARGE`, and iterative beyond, or where the
+    factorisation fails. The solver's options have the prefix `reference_`; the digest is recorded.
 
     Raises:
         SolveError: corrections do not become small.
     """
     if method == "auto":
-        large = sum(scene.sizes.values()) > LARGE[scene.dimension]
-        try:
-            return solve(scene, "iterative" if large else "direct", scene_digest)
-        except SolveError:
-            if large:
-                raise
-            return solve(scene, "iterative", scene_digest)
-    matrix, b = one_block(scene), np.concatenate([scene.rhs[f] for f in scene.fields])
-    with _direct(matrix) if method == "direct" else _iterative(scene) as (correct, words):
+        if sum(scene.sizes.values()) <= LARGE[scene.dimension]:
+            with suppress(SolveError):
+                return solve(scene, "direct", scene_digest)
+        return solve(scene, "iterative", scene_digest)
+    matrix, b = one_block(scene), together(scene, scene.rhs)
+    with factors(matrix) if method == "direct" else _krylov(scene) as (correct, _):
         x, corrections = refine(matrix, b, correct, [scene.sizes[f] for f in scene.fields])
+    words = "LU of the equilibrated matrix"
+    if method == "iterative":
+        words = f"the field-split Krylov method to {INNER_RTOL:g}"
     if not corrections[-1] <= USELESS:
-        raise SolveError(
-            f"no reference solution: after {len(corrections)} corrections by {words} the last one is still "
-            f"{corrections[-1]:.1e} of the solution"
-        )
+        size = f"correction {len(corrections)} by {words} is still {corrections[-1]:.1e} of the solution"
+        raise SolveError(f"no reference solution: {size}")
     solution = by_field(scene, x)
     exact = by_field(scene, residual(matrix, b, x, np.zeros_like(x)))
     return Reference(solution, words, tuple(corrections), backward_error(scene, solution, exact), scene_digest)
@@ -144,6 +130,11 @@ def one_block(scene: Scene, fields: Sequence[str] = ()) -> CSR:
 def rows_of(block: CSR) -> NDArray[np.int64]:
     """Row number of each entry."""
     return np.repeat(np.arange(block.indptr.size - 1), np.diff(block.indptr))
+
+
+def together(scene: Scene, values: FieldArrays) -> Floats:
+    """All fields as one vector, numbered as `one_block`."""
+    return np.concatenate([values[f] for f in scene.fields])
 
 
 def by_field(scene: Scene, vector: Floats) -> dict[str, Floats]:
@@ -174,11 +165,7 @@ def _halves(a: Floats) -> tuple[Floats, Floats]:
 
 
 def residual(matrix: CSR, b: Floats, x: Floats, y: Floats) -> Floats:
-    """The residual b - A (x + y), each entry rounded once: products are exact, and sums are those of `math.fsum`.
-
-    Raises:
-        SolveError: a sum is not finite.
-    """
+    """The residual b - A (x + y), each entry rounded once: products are exact, and sums are those of `math.fsum`."""
     p, e = two_product(-matrix.data, x[matrix.indices])
     e -= matrix.data * y[matrix.indices]
     ends = matrix.indptr.tolist()
@@ -193,17 +180,11 @@ def residual(matrix: CSR, b: Floats, x: Floats, y: Floats) -> Floats:
 def refine(matrix: CSR, b: Floats, correct: Solve, sizes: list[int]) -> tuple[Floats, list[float]]:
     """Correct a solution, from zero, until corrections are small or no longer become smaller.
 
-    Args:
-        matrix: of the system.
-        b: its right-hand side.
-        correct: approximates J⁻¹ r.
-        sizes: of the fields, in each of which a correction has to be small.
-
-    Returns:
-        The solution, rounded; relative size of each correction, in the worst field.
+    `correct` approximates A⁻¹ r; corrections have to be small in each field, of these sizes. Returns the solution,
+    rounded, and the relative size of each correction, in the worst field.
 
     Raises:
-        SolveError: a correction is not finite.
+        SolveError: a correction or residual is not finite.
     """
     high, low = np.zeros(b.size), np.zeros(b.size)
     bounds = np.cumsum(sizes)[:-1]
@@ -249,11 +230,7 @@ def equilibrate(matrix: CSR) -> tuple[Floats, Floats]:
 
 @contextmanager
 def factors(matrix: CSR) -> Iterator[tuple[Solve, Solve]]:
-    """LU of the equilibrated matrix: A⁻¹ and A⁻ᵀ, as functions.
-
-    Raises:
-        SolveError: the matrix cannot be factorised.
-    """
+    """LU of the equilibrated matrix: A⁻¹ and A⁻ᵀ, as functions; a SolveError where it cannot be factorised."""
     from petsc4py import PETSc
 
     n = matrix.indptr.size - 1
@@ -269,19 +246,16 @@ def factors(matrix: CSR) -> Iterator[tuple[Solve, Solve]]:
     pc.setOperators(A)
     x, y = A.createVecs()
 
-    def applied(apply: Callable[[Any, Any], None], left: Floats, right: Floats) -> Solve:
-        def function(v: Floats) -> Floats:
-            y.setArray(right * v)
-            apply(y, x)
-            return np.asarray(left * x.getArray())
-
-        return function
+    def applied(apply: Callable[[Any, Any], None], left: Floats, right: Floats, v: Floats) -> Floats:
+        y.setArray(right * v)
+        apply(y, x)
+        return np.asarray(left * x.getArray())
 
     try:
         with inserted(WORKSPACE if package == "mumps" else {}, PREFIX):
             pc.setFromOptions()
             pc.setUp()
-        yield applied(pc.apply, c, r), applied(pc.applyTranspose, r, c)
+        yield partial(applied, pc.apply, c, r), partial(applied, pc.applyTranspose, r, c)
     except PETSc.Error as e:
         raise SolveError(f"{package} cannot factorise the matrix (error {e.ierr})") from e
     finally:
@@ -290,14 +264,8 @@ def factors(matrix: CSR) -> Iterator[tuple[Solve, Solve]]:
 
 
 @contextmanager
-def _direct(matrix: CSR) -> Iterator[tuple[Solve, str]]:
-    with factors(matrix) as (inverse, _):
-        yield inverse, "LU of the equilibrated matrix"
-
-
-@contextmanager
-def _iterative(scene: Scene) -> Iterator[tuple[Solve, str]]:
-    """The Krylov solver for the scene: its solve, and what it is."""
+def _krylov(scene: Scene) -> Iterator[tuple[Solve, None]]:
+    """The default Krylov solver for the scene, as a function; in the place of `factors`."""
     from mpi4py import MPI
 
     from petsc_fs.solver import Solver
@@ -308,11 +276,10 @@ def _iterative(scene: Scene) -> Iterator[tuple[Solve, str]]:
 
         def correct(r: Floats) -> Floats:
             size = float(np.linalg.norm(r)) or 1.0
-            found = solver.solve(rhs=by_field(scene, r / size)).solution
-            return size * np.concatenate([found[f] for f in scene.fields])
+            return size * together(scene, solver.solve(rhs=by_field(scene, r / size)).solution)
 
         try:
-            yield correct, f"the field-split Krylov method to {INNER_RTOL:g}"
+            yield correct, None
         finally:
             solver.destroy()
 
@@ -322,64 +289,53 @@ def _iterative(scene: Scene) -> Iterator[tuple[Solve, str]]:
 
 def weights(scene: Scene) -> dict[str, Floats]:
     """Weight w of each unknown, (size,) per field, such that the square of a field's norm is Σ w x²."""
-    return {f: _weights(scene, f) for f in scene.fields}
-
-
-def _weights(scene: Scene, name: str) -> Floats:
-    volumes = scene.cell_volumes.get(name)
-    if volumes is None or not volumes.size or not (volumes > 0).all():
-        return np.ones(scene.sizes[name])
-    if name in FLUXES:
-        per_cell = 1.0 / volumes
-    else:
+    found = {}
+    for name, size in scene.sizes.items():
+        volumes = scene.cell_volumes.get(name)
+        if volumes is None or not volumes.size or not (volumes > 0).all():
+            found[name] = np.ones(size)
+            continue
         dimension = scene.cell_dimension if name == "mass" else None
         groups = np.zeros(volumes.size, dtype=np.int64) if dimension is None else np.asarray(dimension)
-        per_cell = volumes / np.bincount(groups, weights=volumes)[groups]
-    return np.repeat(per_cell, scene.block_size(name))
+        per_cell = 1.0 / volumes if name in FLUXES else volumes / np.bincount(groups, weights=volumes)[groups]
+        found[name] = np.repeat(per_cell, scene.block_size(name))
+    return found
 
 
-class Ruler:
-    """Measures solutions of one scene against a reference.
+def forward_error(scene: Scene, reference: FieldArrays, solution: FieldArrays) -> tuple[float, dict[str, float]]:
+    """Forward errors of a solution, all rows of each field.
 
-    Attributes:
-        scale: norm of the reference per field.
+    Returns:
+        Root mean square of the relative errors of the fields, so that each counts alike; relative error per
+        field. Where the reference is zero, the error of a field is absolute, and left out of the first.
+
+    Raises:
+        LayoutError: the reference is not one for this scene.
     """
-
-    def __init__(self, scene: Scene, reference: FieldArrays) -> None:
-        """Take the norms of the reference.
-
-        Raises:
-            LayoutError: the reference is not one for this scene.
-        """
-        for name, size in scene.sizes.items():
-            if name not in reference or reference[name].shape != (size,):
-                raise LayoutError(f"reference: {name} is not there with {size} entries; compute it anew for this scene")
-        self._reference = reference
-        self._weights = {f: w for f, w in weights(scene).items() if w.size}
-        self.scale = {f: _norm(w, reference[f]) for f, w in self._weights.items()}
-
-    def errors(self, solution: FieldArrays) -> tuple[float, dict[str, float]]:
-        """Forward errors of a solution, all rows of each field.
-
-        Returns:
-            Root mean square of the relative errors of the fields, so that each counts alike; relative error per
-            field. Where the reference is zero, the error of a field is absolute, and left out of the first.
-        """
-        absolute = {f: _norm(w, solution[f] - self._reference[f]) for f, w in self._weights.items()}
-        relative = {f: e / self.scale[f] for f, e in absolute.items() if self.scale[f]}
-        total = float(np.sqrt(np.mean(np.square(list(relative.values()))))) if relative else 0.0
-        return total, absolute | relative
+    for name, size in scene.sizes.items():
+        if name not in reference or reference[name].shape != (size,):
+            raise LayoutError(f"reference: {name} is not there with {size} entries; compute it anew for this scene")
+    known = {f: w for f, w in weights(scene).items() if w.size}
+    absolute = {f: _norm(w, solution[f] - reference[f]) for f, w in known.items()}
+    scale = {f: _norm(w, reference[f]) for f, w in known.items()}
+    relative = {f: e / scale[f] for f, e in absolute.items() if scale[f]}
+    total = float(np.sqrt(np.mean(np.square(list(relative.values()))))) if relative else 0.0
+    return total, absolute | relative
 
 
 def _norm(weight: Floats, values: Floats) -> float:
     largest = _greatest(values)  # by which nothing over- or underflows when it is squared
-    if not (largest > 0 and np.isfinite(largest)):
+    if not 0 < largest < np.inf:
         return largest
     return largest * float(np.sqrt(np.sum(weight * (values / largest) ** 2)))
 
 
 def _greatest(values: Floats) -> float:
     return float(np.max(np.abs(values), initial=0.0))
+
+
+def _greatest_of(values: FieldArrays) -> float:
+    return max(map(_greatest, values.values()), default=0.0)
 
 
 def multiply(block: CSR, x: Floats) -> Floats:
@@ -408,10 +364,7 @@ def backward_error(scene: Scene, solution: FieldArrays, of: FieldArrays | None =
         fieldwise       the largest over the fields of |b - J x| / |s| in its rows, which no scaling of whole fields and
                         no units change; what `field_conditions` bound errors by
 
-    Args:
-        scene: with all rows.
-        solution: all rows of each field.
-        of: the residual, where it is known, maybe to better than double precision.
+    All rows of a scene and of its solution; `of` is the residual, where it is known to better than double precision.
     """
     if of is None:
         known = {f: np.array(scene.rhs[f]) for f in scene.fields}
@@ -419,20 +372,17 @@ def backward_error(scene: Scene, solution: FieldArrays, of: FieldArrays | None =
             known[r] -= multiply(block, solution[c])
         of = known
     scales = magnitudes(scene, solution)
-    sums = {f: np.zeros(n) for f, n in scene.sizes.items()}
-    for (name, column), block in scene.blocks.items():
-        sums[name] += multiply(block._replace(data=np.abs(block.data)), np.ones(scene.sizes[column]))
-    norm = max(map(_greatest, sums.values()), default=0.0) * max(map(_greatest, solution.values()), default=0.0)
-    norm += max(map(_greatest, scene.rhs.values()), default=0.0)
+    ones = {f: np.ones(n) for f, n in scene.sizes.items()}
+    sums = magnitudes(replace(scene, rhs={f: 0 * v for f, v in ones.items()}), ones)
+    norm = _greatest_of(sums) * _greatest_of(solution) + _greatest_of(scene.rhs)
     componentwise = fieldwise = 0.0
     for f, rest in of.items():
-        exact = np.where(rest == 0, 0.0, np.inf)
-        componentwise = max(
-            componentwise, _greatest(np.divide(np.abs(rest), scales[f], out=exact, where=scales[f] > 0))
-        )
+        share = np.where(rest == 0, 0.0, np.inf)
+        np.divide(np.abs(rest), scales[f], out=share, where=scales[f] > 0)
+        componentwise = max(componentwise, _greatest(share))
         size, scale = float(np.linalg.norm(rest)), float(np.linalg.norm(scales[f]))
         fieldwise = max(fieldwise, size / scale if scale else float(size > 0))
-    normwise = max(map(_greatest, of.values()), default=0.0) / norm if norm else 0.0
+    normwise = _greatest_of(of) / norm if norm else 0.0
     return {"normwise": normwise, "componentwise": componentwise, "fieldwise": fieldwise}
 
 
@@ -444,28 +394,21 @@ def field_conditions(scene: Scene, solution: FieldArrays) -> dict[str, float]:
     error of at most sqrt(fields) eta times it; no scaling of equations by field and no units change it. Estimated from
     below, by power iteration with the factors of the equilibrated matrix.
 
-    Local, on one rank.
-
-    Args:
-        scene: with all rows.
-        solution: accurate.
-
-    Returns:
-        Per field; infinite where the field's solution is zero.
+    Local, for a whole scene and its accurate solution; infinite where a field's solution is zero.
 
     Raises:
         SolveError: the matrix cannot be factorised.
     """
-    largest = max((_greatest(b) for b in scene.rhs.values()), default=0.0)
+    largest = _greatest_of(scene.rhs)
     factor = 2.0 ** -np.frexp(largest)[1] if largest else 1.0  # so that no square over- or underflows
     scene = replace(scene, rhs={f: factor * b for f, b in scene.rhs.items()}, reference={})
     solution = {f: factor * x for f, x in solution.items()}
     sizes = {f: np.linalg.norm(v) for f, v in magnitudes(scene, solution).items()}
-    S = np.concatenate([np.full(scene.sizes[f], sizes[f]) for f in scene.fields])
+    S = np.repeat([sizes[f] for f in scene.fields], [scene.sizes[f] for f in scene.fields])
     natural, random, found = weights(scene), np.random.default_rng(0), {}
     with factors(one_block(scene)) as (inverse, transposed):
         for name in scene.fields:
-            W = np.concatenate([np.sqrt(natural[f]) * (f == name) for f in scene.fields])
+            W = together(scene, {f: np.sqrt(w) * float(f == name) for f, w in natural.items()})
             v, norm = random.standard_normal(S.size), 0.0
             for _ in range(POWER_STEPS):
                 forward = W * inverse(S * v / (np.linalg.norm(v) or 1.0))
@@ -473,7 +416,7 @@ def field_conditions(scene: Scene, solution: FieldArrays) -> dict[str, float]:
                     raise SolveError("no condition number: the factors of the matrix are not finite")
                 norm = float(np.linalg.norm(forward))
                 v = S * transposed(W * forward)
-            size = float(np.linalg.norm(W * np.concatenate([solution[f] for f in scene.fields])))
+            size = float(np.linalg.norm(W * together(scene, solution)))
             found[name] = norm / size if size else float("inf")
     return found
 
@@ -495,11 +438,7 @@ def write(reference: Reference, path: str | os.PathLike[str]) -> None:
 
 
 def read(path: str | os.PathLike[str]) -> Reference:
-    """Read what `write` wrote.
-
-    Raises:
-        SceneError: the file is not there or no reference.
-    """
+    """Read what `write` wrote; a SceneError where it is not there or no reference."""
     try:
         with np.load(path) as arrays:
             about = json.loads(str(arrays["about"]))
@@ -521,10 +460,8 @@ def made(scene: str | os.PathLike[str], target: Path) -> Reference:
 
     from petsc_fs.tools.measure import environment
 
-    if target.exists():
-        found = read(target)
-        if found.scene_digest == digest(scene):
-            return found
+    if target.exists() and (found := read(target)).scene_digest == digest(scene):
+        return found
     target.parent.mkdir(parents=True, exist_ok=True)
     said = ""
     for method in ("auto", "iterative"):

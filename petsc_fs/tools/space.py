@@ -31,11 +31,16 @@ from __future__ import annotations
 import difflib
 import itertools
 import math
+import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from petsc_fs import options
 from petsc_fs.errors import UsageError
@@ -47,13 +52,13 @@ Changes = dict[str, str | None]
 ABSENT = "(absent)"
 """Label of the choice not to have an option."""
 
-KINDS = ("choices", "integer", "float", "log")
 EXTRAS = {
     "choices": ("option", "start", "when"),
     "integer": ("option", "start", "when", "step"),
     "float": ("option", "start", "when", "step", "points"),
     "log": ("option", "start", "when", "points"),
 }
+"""Kinds of parameters, with what else an entry may have."""
 GRID_POINTS = 3
 
 
@@ -63,7 +68,7 @@ class Parameter:
 
     name: str  # GROUP.NAME
     option: str  # that it sets, by full name without the dash
-    kind: str  # of KINDS
+    kind: str  # of EXTRAS
     choices: Mapping[str, Changes]  # of a categorical one, by label: the options that each sets
     bounds: tuple[float, float]  # of a numeric one, both included
     step: float | None  # between values of a numeric one
@@ -93,16 +98,12 @@ class Parameter:
             return list(range(int(low), int(high) + 1, int(self.step or 1)))
         if self.step is not None:
             return [low + k * self.step for k in range(math.floor((high - low) / self.step + 1e-9) + 1)]
-        parts = [k / (self.points - 1) for k in range(self.points)]
-        if self.kind == "log":
-            return [min(max(low * (high / low) ** part, low), high) for part in parts]
-        return [min(low + part * (high - low), high) for part in parts]
+        spaced = np.geomspace if self.kind == "log" else np.linspace
+        return [float(v) for v in spaced(low, high, self.points)]
 
     def changes(self, value: Value) -> Changes:
         """The options that a value stands for."""
-        if self.kind == "choices":
-            return dict(self.choices[str(value)])
-        return {self.option: label(value)}
+        return dict(self.choices[str(value)]) if self.kind == "choices" else {self.option: label(value)}
 
 
 @dataclass(frozen=True)
@@ -114,42 +115,35 @@ class Space:
     base: Path  # options file
     parameters: tuple[Parameter, ...]  # each after those that its `when` names
 
-    def suggest(self, trial: Any) -> dict[str, Value]:
-        """The values that a sampler takes for all parameters that exist together."""
-        values: dict[str, Value] = {}
+    def values(self, choose: Callable[[Parameter], Value | None]) -> dict[str, Value]:
+        """What is chosen for all parameters that exist together; nothing where that is None."""
+        found: dict[str, Value] = {}
         for parameter in self.parameters:
-            if parameter.active(values):
-                values[parameter.name] = parameter.suggest(trial)
-        return values
+            if parameter.active(found) and (value := choose(parameter)) is not None:
+                found[parameter.name] = value
+        return found
+
+    def suggest(self, trial: Any) -> dict[str, Value]:
+        """The values that a sampler takes."""
+        return self.values(lambda parameter: parameter.suggest(trial))
 
     def start(self) -> dict[str, Value]:
         """The values of the first trial, as far as they are given."""
-        values: dict[str, Value] = {}
-        for parameter in self.parameters:
-            if parameter.start is not None and parameter.active(values):
-                values[parameter.name] = parameter.start
-        return values
+        return self.values(lambda parameter: parameter.start)
 
-    def grid(self) -> Iterator[dict[str, Value]]:
+    def grid(self) -> list[dict[str, Value]]:
         """All combinations of values on the grid, each once: parameters that do not exist do not multiply them."""
-
-        def extend(values: dict[str, Value], rest: tuple[Parameter, ...]) -> Iterator[dict[str, Value]]:
-            if not rest:
-                yield values
-            elif rest[0].active(values):
-                for value in rest[0].grid():
-                    yield from extend(values | {rest[0].name: value}, rest[1:])
-            else:
-                yield from extend(values, rest[1:])
-
-        return extend({}, self.parameters)
+        found: list[dict[str, Value]] = [{}]
+        for p in self.parameters:
+            found = [v | more for v in found for more in ([{p.name: x} for x in p.grid()] if p.active(v) else [{}])]
+        return found
 
     def changes(self, values: Mapping[str, Value]) -> Changes:
         """What the values of parameters change in the base file."""
-        known = {p.name: p for p in self.parameters}
         found: Changes = {}
-        for name, value in values.items():
-            found.update(known[name].changes(value))
+        for parameter in self.parameters:
+            if parameter.name in values:
+                found |= parameter.changes(values[parameter.name])
         base = options.parse(self.base)
         return {k: v for k, v in found.items() if (v is None and k in base) or (v is not None and base.get(k) != v)}
 
@@ -169,11 +163,7 @@ def shipped() -> list[Path]:
 
 
 def find_space(name: str) -> Path:
-    """Path of a space: as given, or else one that is shipped under this name.
-
-    Raises:
-        UsageError: there is none.
-    """
+    """Path of a space: as given, or else one that is shipped under this name; a UsageError where there is none."""
     path = Path(name)
     if path.is_file():
         return path
@@ -183,12 +173,17 @@ def find_space(name: str) -> Path:
     raise UsageError(f"space {name}: no such file; shipped are {', '.join(p.name for p in shipped())}")
 
 
-def read(path: Path) -> Space:
-    """Read a space.
+@contextmanager
+def _at(where: str) -> Iterator[None]:
+    """Say where an error was made."""
+    try:
+        yield
+    except UsageError as e:
+        raise UsageError(f"{where}: {e}") from e
 
-    Raises:
-        UsageError: the file cannot be read or makes no sense; the message names the parameter and the remedy.
-    """
+
+def read(path: Path) -> Space:
+    """Read a space; a UsageError names the parameter that makes no sense, and the remedy."""
     import yaml
 
     try:
@@ -197,220 +192,196 @@ def read(path: Path) -> Space:
         raise UsageError(f"space {path}: not readable as text: {e}") from e
     except yaml.YAMLError as e:
         raise UsageError(f"space {path}: not YAML: {' '.join(str(e).split())}") from e
-    top = _mapping(content, f"space {path}", ("description", "base", "groups"), required=("base", "groups"))
-    beside = path.parent / str(top["base"])
-    try:
-        base = beside if beside.is_file() else options.find_options_file(str(top["base"]))
-        given = options.parse(base)
-    except UsageError as e:
-        raise UsageError(f"space {path}: base: {e}") from e
     parameters: dict[str, Parameter] = {}
-    for group, raw in _mapping(top["groups"], f"space {path}: groups").items():
-        where = f"space {path}: group {group}"
-        entries = _mapping(raw, where, ("prefix", "parameters"), required=("parameters",))
-        prefix = str(entries.get("prefix") or "").removeprefix("-")
-        _check_prefix(prefix, given, where, base.name)
-        for name, spec in _mapping(entries["parameters"], f"{where}: parameters").items():
-            full = f"{group}.{name}"
-            place = f"space {path}: parameter {full}"
-            parameters[full] = _parameter(full, prefix, spec, before=parameters, given=given, where=place)
-    if not parameters:
-        raise UsageError(f"space {path}: no parameters; declare some under groups")
-    _check_unique(parameters.values(), f"space {path}")
+    with _at(f"space {path}"):
+        top = _mapping(content, ("description", "base", "groups"), required=("base", "groups"))
+        base = path.parent / str(top["base"])
+        with _at("base"):
+            base = base if base.is_file() else options.find_options_file(str(top["base"]))
+            given = options.parse(base)
+        for group, raw in _mapping(top["groups"]).items():
+            with _at(f"group {group}"):
+                entries = _mapping(raw, ("prefix", "parameters"), required=("parameters",))
+                prefix = str(entries.get("prefix") or "").removeprefix("-")
+                _check_prefix(prefix, given, base.name)
+                specs = _mapping(entries["parameters"])
+            for name, spec in specs.items():
+                full = f"{group}.{name}"
+                with _at(f"parameter {full}"):
+                    parameters[full] = _parameter(full, prefix, spec, parameters, given)
+        if not parameters:
+            raise UsageError("no parameters; declare some under groups")
+        _check_unique(parameters.values())
     return Space(path, str(top.get("description") or path.stem), base, tuple(parameters.values()))
 
 
-def _mapping(
-    raw: Any, where: str, allowed: Sequence[str] | None = None, required: Sequence[str] = ()
-) -> dict[str, Any]:
+def _mapping(raw: Any, allowed: Sequence[str] | None = None, required: Sequence[str] = ()) -> dict[str, Any]:
     """A mapping with names for keys, of which some are allowed and some required."""
     if not isinstance(raw, dict) or not all(isinstance(key, str) for key in raw):
-        raise UsageError(f"{where}: expected a mapping of names, found {_shown(raw)}")
+        raise UsageError(f"expected a mapping of names, found {_shown(raw)}")
     for key in raw:
         if allowed is not None and key not in allowed:
-            similar = difflib.get_close_matches(key, allowed, n=1)
-            hint = f"did you mean {similar[0]}?" if similar else f"expected {', '.join(allowed)}"
-            raise UsageError(f"{where}: unknown entry {key!r}; {hint}")
+            hint = _similar(key, allowed) or f"expected {', '.join(allowed)}"
+            raise UsageError(f"unknown entry {key!r}; {hint}")
     for key in required:
         if key not in raw:
-            raise UsageError(f"{where}: {key!r} is missing")
+            raise UsageError(f"{key!r} is missing")
     return raw
 
 
 def _shown(raw: Any) -> str:
-    text = repr(raw)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    return textwrap.shorten(repr(raw), 60, placeholder="...")
 
 
-def _check_prefix(prefix: str, given: Iterable[str], where: str, base: str) -> None:
+def _similar(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
+    found = difflib.get_close_matches(name, sorted(known), n=1, cutoff=cutoff)
+    return f"did you mean {found[0]}?" if found else ""
+
+
+def _check_prefix(prefix: str, given: Iterable[str], base: str) -> None:
     stem = "".join(re.findall(rf".*{options.SPLIT}", prefix))  # what follows is a part of the options' own names
-    if any(name.startswith(stem) for name in given):
-        return
-    splits = {name[: m.end()] for name in given for m in re.finditer(options.SPLIT, name)}
-    similar = difflib.get_close_matches(stem, sorted(splits), n=1, cutoff=0.3)
-    hint = f"; did you mean {similar[0]}?" if similar else "; leave it away for the outermost level"
-    raise UsageError(f"{where}: no option of {base} has the prefix {stem!r}{hint}")
+    if not any(name.startswith(stem) for name in given):
+        splits = {name[: m.end()] for name in given for m in re.finditer(options.SPLIT, name)}
+        hint = _similar(stem, splits, cutoff=0.3) or "leave it away for the outermost level"
+        raise UsageError(f"no option of {base} has the prefix {stem!r}; {hint}")
 
 
-def _check_unique(parameters: Iterable[Parameter], where: str) -> None:
+def _check_unique(parameters: Iterable[Parameter]) -> None:
     """No two parameters that always exist set the same option."""
     setters: dict[str, str] = {}
     for parameter in parameters:
         for option in {parameter.option, *itertools.chain(*parameter.choices.values())} if not parameter.when else ():
             if option in setters:
                 raise UsageError(
-                    f"{where}: parameters {setters[option]} and {parameter.name} both set -{option}; "
+                    f"parameters {setters[option]} and {parameter.name} both set -{option}; "
                     "take one away, or tell by 'when' which of them holds"
                 )
             setters[option] = parameter.name
 
 
 def _parameter(
-    name: str, prefix: str, raw: Any, *, before: Mapping[str, Parameter], given: Mapping[str, str | None], where: str
+    name: str, prefix: str, raw: Any, before: Mapping[str, Parameter], given: Mapping[str, str | None]
 ) -> Parameter:
-    """One parameter from its entry in the file."""
-    spec = _mapping(raw, where, (*KINDS, *EXTRAS["float"]))
-    kinds = [kind for kind in KINDS if kind in spec]
+    """One parameter from its entry in the file, after those before it."""
+    spec = _mapping(raw, (*EXTRAS, *EXTRAS["float"]))
+    kinds = [kind for kind in EXTRAS if kind in spec]
     if len(kinds) != 1:
-        raise UsageError(f"{where}: expected exactly one of {', '.join(KINDS)}, found {', '.join(kinds) or 'none'}")
-    kind = kinds[0]
+        raise UsageError(f"expected exactly one of {', '.join(EXTRAS)}, found {', '.join(kinds) or 'none'}")
+    (kind,) = kinds
     for key in spec:
         if key != kind and key not in EXTRAS[kind]:
-            raise UsageError(f"{where}: {key!r} does not go with {kind!r}; take it away")
+            raise UsageError(f"{key!r} does not go with {kind!r}; take it away")
     option = prefix + str(spec.get("option", name.partition(".")[2])).removeprefix("-")
     if not re.fullmatch(r"[A-Za-z_]\w*", option):
-        raise UsageError(f"{where}: {option!r} is no name of an option; name it with 'option: NAME'")
-    choices = _choices(spec[kind], option, prefix, where) if kind == "choices" else {}
-    bounds = (0.0, 0.0) if kind == "choices" else _bounds(spec[kind], kind, where)
-    step = _positive(spec, "step", kind, where)
-    points = _positive(spec, "points", "integer", where)
-    if points is not None and points < 2:
-        raise UsageError(f"{where}: points {points:g}: a grid needs both ends; take at least 2")
+        raise UsageError(f"{option!r} is no name of an option; name it with 'option: NAME'")
+    with _at("when"):
+        when = _conditions(spec.get("when", {}), name, before)
+    points = _positive(spec, "points", "integer") or GRID_POINTS
+    if points < 2:
+        raise UsageError(f"points {points:g}: a grid needs both ends; take at least 2")
     parameter = Parameter(
         name=name,
         option=option,
         kind=kind,
-        choices=choices,
-        bounds=bounds,
-        step=step,
-        points=int(points or GRID_POINTS),
+        choices=_choices(spec[kind], option, prefix) if kind == "choices" else {},
+        bounds=(0.0, 0.0) if kind == "choices" else _bounds(spec[kind], kind),
+        step=_positive(spec, "step", kind),
+        points=int(points),
         start=None,
-        when=_conditions(spec.get("when", {}), name, before, where),
+        when=when,
     )
-    start = _start(spec, parameter, given, where)
-    return Parameter(**{**vars(parameter), "start": start})
+    return replace(parameter, start=_start(spec, parameter, given))
 
 
-def _choices(raw: Any, option: str, prefix: str, where: str) -> dict[str, Changes]:
+def _choices(raw: Any, option: str, prefix: str) -> dict[str, Changes]:
     if isinstance(raw, list) and raw and all(v is None or isinstance(v, str | int | float) for v in raw):
         found: dict[str, Changes] = {_text(v) or ABSENT: {option: _text(v)} for v in raw}
         if len(found) < len(raw):
-            raise UsageError(f"{where}: choices: a value occurs twice")
+            raise UsageError("choices: a value occurs twice")
         return found
-    if isinstance(raw, dict) and raw:
-        return {
-            str(name): {
-                prefix + key.removeprefix("-"): _text(value)
-                for key, value in _mapping(entry or {}, f"{where}: choice {name}").items()
-            }
-            for name, entry in raw.items()
-        }
-    raise UsageError(
-        f"{where}: choices: expected a list of values, or a mapping from names to options; found {_shown(raw)}"
-    )
+    if not (isinstance(raw, dict) and raw):
+        raise UsageError(f"choices: expected a list of values, or a mapping from names to options; found {_shown(raw)}")
+    entries = {str(name): _mapping(entry or {}) for name, entry in raw.items()}
+    return {
+        name: {prefix + key.removeprefix("-"): _text(value) for key, value in entry.items()}
+        for name, entry in entries.items()
+    }
 
 
 def _text(value: Any) -> str | None:
     """A value in YAML as an option's value."""
     if value is None:
         return None
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    return label(value) if isinstance(value, float) else str(value)
+    return str(value).lower() if isinstance(value, bool) else label(value)
 
 
-def _bounds(raw: Any, kind: str, where: str) -> tuple[float, float]:
+def _bounds(raw: Any, kind: str) -> tuple[float, float]:
     numbers = [_number(v) for v in raw] if isinstance(raw, list) else []
-    if len(numbers) != 2 or any(v is None for v in numbers):
-        hint = "; YAML wants 1.0e-3 for 1e-3" if re.search(r"'\S*\de", repr(raw)) else ""
-        raise UsageError(f"{where}: {kind}: expected [least, greatest], found {_shown(raw)}{hint}")
-    low, high = (float(v) for v in numbers if v is not None)
+    if len(numbers) != 2 or numbers[0] is None or numbers[1] is None:
+        raise UsageError(f"{kind}: expected [least, greatest], found {_shown(raw)}")
+    low, high = numbers[0], numbers[1]
     if not low < high:
-        raise UsageError(f"{where}: {kind}: the least value {low:g} is not below the greatest, {high:g}")
+        raise UsageError(f"{kind}: the least value {low:g} is not below the greatest, {high:g}")
     if kind == "log" and low <= 0:
-        raise UsageError(f"{where}: log: values must be positive, found {low:g}; take 'float'")
-    if kind == "integer" and (low != int(low) or high != int(high)):
-        raise UsageError(f"{where}: integer: expected whole numbers, found {_shown(raw)}; or take 'float'")
+        raise UsageError(f"log: values must be positive, found {low:g}; take 'float'")
+    if kind == "integer" and not (low.is_integer() and high.is_integer()):
+        raise UsageError(f"integer: expected whole numbers, found {_shown(raw)}; or take 'float'")
     return low, high
 
 
 def _number(value: Any) -> float | None:
-    """A number as YAML has it; `1e-3`, which YAML 1.1 takes for text, is one, too."""
-    if isinstance(value, bool) or not isinstance(value, str | int | float):
-        return None
+    """A finite number as YAML has it; `1e-3`, which YAML 1.1 takes for text, is one, too."""
     try:
-        number = float(value)
-    except ValueError:
+        number = float("nan" if isinstance(value, bool) else value)
+    except (TypeError, ValueError):
         return None
     return number if math.isfinite(number) else None
 
 
-def _positive(spec: Mapping[str, Any], key: str, kind: str, where: str) -> float | None:
-    if key not in spec:
-        return None
-    number = _number(spec[key])
-    if number is None or number <= 0 or (kind == "integer" and number != int(number)):
-        raise UsageError(f"{where}: {key}: expected a positive number, found {_shown(spec[key])}")
+def _positive(spec: Mapping[str, Any], key: str, kind: str) -> float | None:
+    number = _number(spec.get(key))
+    if key in spec and (number is None or number <= 0 or (kind == "integer" and not number.is_integer())):
+        raise UsageError(f"{key}: expected a positive number, found {_shown(spec[key])}")
     return number
 
 
-def _conditions(raw: Any, name: str, before: Mapping[str, Parameter], where: str) -> dict[str, tuple[str, ...]]:
+def _conditions(raw: Any, name: str, before: Mapping[str, Parameter]) -> dict[str, tuple[str, ...]]:
     found = {}
-    for other, allowed in _mapping(raw, f"{where}: when").items():
+    for other, allowed in _mapping(raw).items():
         full = other if "." in other else f"{name.partition('.')[0]}.{other}"
         if full not in before:
-            similar = difflib.get_close_matches(full, before, n=1)
-            hint = f"did you mean {similar[0]}?" if similar else "declare it before this one"
-            raise UsageError(f"{where}: when: there is no parameter {full} before this one; {hint}")
-        labels = tuple(_text(v) or ABSENT for v in (allowed if isinstance(allowed, list) else [allowed]))
+            hint = _similar(full, before) or "declare it before this one"
+            raise UsageError(f"there is no parameter {full} before this one; {hint}")
+        found[full] = tuple(_text(v) or ABSENT for v in (allowed if isinstance(allowed, list) else [allowed]))
         choices = before[full].choices
-        for wanted in labels if choices else ():
+        for wanted in found[full] if choices else ():
             if wanted not in choices:
-                raise UsageError(f"{where}: when: {full} is never {wanted!r}; its choices are {', '.join(choices)}")
-        found[full] = labels
+                raise UsageError(f"{full} is never {wanted!r}; its choices are {', '.join(choices)}")
     return found
 
 
-def _start(spec: Mapping[str, Any], parameter: Parameter, given: Mapping[str, str | None], where: str) -> Value | None:
+def _start(spec: Mapping[str, Any], parameter: Parameter, given: Mapping[str, str | None]) -> Value | None:
     """Value of the first trial: as the space says, or else as the base file has it."""
     if parameter.kind == "choices":
+        if "start" not in spec:
+            as_given = (name for name, c in parameter.choices.items() if all(given.get(k) == v for k, v in c.items()))
+            return next(as_given, None)
+        start = _text(spec["start"]) or ABSENT
+        if start not in parameter.choices:
+            raise UsageError(f"start: {start!r} is none of the choices {', '.join(parameter.choices)}")
+        return start
+    number, (low, high) = _number(spec.get("start", given.get(parameter.option))), parameter.bounds
+    if number is None or not low <= number <= high:
         if "start" in spec:
-            start = _text(spec["start"]) or ABSENT
-            if start not in parameter.choices:
-                raise UsageError(f"{where}: start: {start!r} is none of the choices {', '.join(parameter.choices)}")
-            return start
-        for name, changes in parameter.choices.items():
-            if all(given.get(k) == v for k, v in changes.items()):
-                return name
-        return None
-    number = _number(spec.get("start", given.get(parameter.option)))
-    if number is None and "start" in spec:
-        raise UsageError(f"{where}: start: expected a number, found {_shown(spec['start'])}")
-    if number is None or not parameter.bounds[0] <= number <= parameter.bounds[1]:
-        if "start" in spec:
-            low, high = parameter.bounds
-            raise UsageError(f"{where}: start {number:g} is outside of [{low:g}, {high:g}]")
+            raise UsageError(f"start {_shown(spec['start'])} is no number in [{low:g}, {high:g}]")
         return None
     return int(number) if parameter.kind == "integer" else number
 
 
 def edit(text: str, changes: Mapping[str, str | None]) -> str:
-    """An options file with some options changed, and its comments and nesting kept.
+    """An options file with some options changed, by full name, and its comments and nesting kept.
 
-    Args:
-        text: of the file, as `petsc_fs.options.parse` reads it.
-        changes: options by full name without the dash. None takes an option out; one that the file does not have
-            comes after the options that are nearest to it, in their prefix.
+    None takes an option out; one that the file does not have comes after those nearest to it, in their prefix.
     """
     lines = text.splitlines()
     places: list[tuple[str, str]] = []  # of each line: prefix in force, full name of its option or nothing
@@ -428,27 +399,32 @@ def edit(text: str, changes: Mapping[str, str | None]) -> str:
     for full, value in changes.items():
         if full not in there and value is not None:
             k = _place(full, places)
-            scope = places[k][0] if k >= 0 else ""
-            indent = re.match(r"\s*", lines[k])[0] if k >= 0 else ""  # type: ignore[index]
-            after.setdefault(k, []).append(f"{indent}-{full.removeprefix(scope)} {value}".rstrip())
+            after.setdefault(k, []).append(
+                _line(lines[k] if k >= 0 else "", places[k][0] if k >= 0 else "", full, value)
+            )
     result = after.get(-1, [])
     for k, (line, (scope, full)) in enumerate(zip(lines, places, strict=True)):
-        if full not in changes or not full:
-            result.append(line)
-        elif changes[full] is not None:
-            indent = line[: len(line) - len(line.lstrip())]
+        value = changes.get(full) if full else None
+        if value is not None:
             comment = f"  # {line.partition('#')[2].strip()}" if "#" in line else ""
-            result.append(f"{indent}-{full.removeprefix(scope)} {changes[full]}".rstrip() + comment)
+            result.append(_line(line, scope, full, value) + comment)
+        elif not full or full not in changes:
+            result.append(line)
         result += after.get(k, [])
     return "\n".join(result) + "\n"
 
 
+def _line(like: str, scope: str, full: str, value: str) -> str:
+    """A line for an option, indented like another one, below a prefix."""
+    indent = like[: len(like) - len(like.lstrip())]
+    return f"{indent}-{full.removeprefix(scope)} {value}".rstrip()
+
+
 def _place(full: str, places: Sequence[tuple[str, str]]) -> int:
-    """The line after which a new option comes: in the longest prefix that it has, by the most similar name."""
-    best, where = (-1, -1), -1
-    for k, (scope, name) in enumerate(places):
-        if name and full.startswith(scope):
-            common = sum(1 for _ in itertools.takewhile(lambda ab: ab[0] == ab[1], zip(full, name, strict=False)))
-            if (len(scope), common) >= best:
-                best, where = (len(scope), common), k
-    return where
+    """The line after which a new option comes: in the longest prefix that it has, by the most similar name, or -1."""
+    near = [
+        (len(scope), len(os.path.commonprefix([full, name])), k)  # noqa: RUF071 -- of characters
+        for k, (scope, name) in enumerate(places)
+        if name and full.startswith(scope)
+    ]
+    return max(near, default=(0, 0, -1))[-1]

@@ -18,8 +18,8 @@ import tempfile
 import textwrap
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +29,7 @@ from petsc_fs import options
 from petsc_fs.errors import SolveError, UsageError
 from petsc_fs.io import hdf5
 from petsc_fs.io.files import write_text
-from petsc_fs.tools.measure import Job, Record, Variant, measure_all, seconds_of, split_ranks
+from petsc_fs.tools.measure import Job, Record, Variant, measure_all, positive, seconds_of, split_ranks
 from petsc_fs.tools.pages import markdown
 from petsc_fs.tools.stress_cases import StressCase, catalogue, held_out
 
@@ -65,44 +65,26 @@ RETRY = "(default, retry)"
 """The same with -petsc_fs_retry retry.opts."""
 
 
-@dataclass(frozen=True)
-class Truth:
-    """What is known of a case before anything is solved; see `petsc_fs.tools.stress_cases.StressCase` for the rest."""
+Case = dict[str, Any]
+"""What is known of a case before anything is solved, as JSON can hold it: what `StressCase` says of it in words, and
 
-    name: str
-    group: str
-    hard: str
-    source: str
-    fields: tuple[str, ...]  # of the scene
-    unknowns: int  # number of them
-    path: str  # of the scene
-    reference: str  # file of the reference solution; "" if there is none
-    no_reference: str  # why
-    conditions: dict[str, float]  # see `petsc_fs.tools.reference.field_conditions`
-    singular: bool
-    solvable: bool = True
-    held_out: bool = False
+    fields, unknowns     of the scene, and their number
+    conditions           of each field, see `petsc_fs.tools.reference.field_conditions`
+    no_reference         why there is no reference solution; "" if there is one
+    path, reference      files of the scene and of the reference, "" if there is none or no single one; not reported
+"""
 
+Finding = dict[str, Any]
+"""What came of one case with one options file on some ranks; as `petsc_fs.tools.measure` has it, but for
 
-@dataclass(frozen=True)
-class Finding:
-    """What came of one case with one options file on some ranks."""
-
-    case: str  # its name
-    file: str  # name of the options file, or DEFAULT or RETRY
-    ranks: int
-    outcome: str  # one of OUTCOMES
-    kind: str  # of `petsc_fs.tools.measure.KINDS`
-    message: str  # what was said
-    iterations: int | None  # of the outer Krylov method
-    reason: str | None  # why it stopped
-    error_by_field: dict[str, float] | None  # relative, in natural norms
-    backward_error: dict[str, float] | None  # normwise, componentwise and fieldwise
-    allowed_by_field: dict[str, float]  # the largest errors that count as right
-    seconds: float | None  # set-up and solve
+    case, file           names; file may be DEFAULT or RETRY
+    outcome              one of OUTCOMES
+    allowed_by_field     the largest errors that count as right
+    seconds              set-up and solve
+"""
 
 
-def prepare(cases: Iterable[StressCase], folder: Path) -> list[Truth]:
+def prepare(cases: Iterable[StressCase], folder: Path) -> list[Case]:
     """Write the scenes, with reference solutions and condition numbers. Initialises PETSc; on one rank."""
     import petsc4py
 
@@ -113,21 +95,19 @@ def prepare(cases: Iterable[StressCase], folder: Path) -> list[Truth]:
     for case in cases:
         scene = case.make()
         path = hdf5.write(scene, folder / f"{case.name}.h5", compression=None)
-        target, why, conditions = "", "", dict[str, float]()
+        known = {name: getattr(case, name) for name in "name group hard source singular solvable held_out".split()}
+        known |= {"fields": scene.fields, "unknowns": sum(scene.sizes.values()), "path": os.fspath(path)}
+        known |= {"reference": "", "no_reference": "", "conditions": {}}
         try:
             with np.errstate(all="ignore"):  # what is not finite is looked for
                 exact = reference.solve(scene, "direct")
-                target = os.fspath(folder / f"{case.name}.npz")
+                target = folder / f"{case.name}.npz"
                 reference.write(exact, target)
-                conditions = reference.field_conditions(scene, exact.solution)
+                known["reference"] = "" if case.singular else os.fspath(target)
+                known["conditions"] = reference.field_conditions(scene, exact.solution)
         except (SolveError, FloatingPointError) as e:
-            why = str(e)
-        same: dict[str, Any] = {
-            name: getattr(case, name) for name in "name group hard source singular solvable held_out".split()
-        }
-        known: dict[str, Any] = {"fields": scene.fields, "unknowns": sum(scene.sizes.values()), "path": os.fspath(path)}
-        target = "" if case.singular else target
-        found.append(Truth(**same, **known, reference=target, no_reference=why, conditions=conditions))
+            known["no_reference"] = str(e)
+        found.append(known)
     return found
 
 
@@ -138,83 +118,65 @@ def variants(more: Mapping[str, str | None]) -> list[Variant]:
     return [Variant(DEFAULT, options=more), Variant(RETRY, options=retried), *files]
 
 
-def run(
-    truths: Sequence[Truth],
-    chosen: Sequence[Variant],
-    *,
-    ranks: Sequence[int] = (1,),
-    time_limit: float = 60.0,
-    mpiexec: str | None = None,
-    say: Callable[[str], None] = lambda line: None,
-) -> Iterator[Finding]:
-    """Solve every case by every variant that fits, on every number of ranks, one process at a time.
+def run(cases: Sequence[Case], chosen: Sequence[Variant], job: Job, ranks: Sequence[int] = (1,)) -> Iterator[Finding]:
+    """Solve every case by every variant that fits, on every number of ranks, one process at a time, as a job says.
 
     A process goes on from scene to scene; after one that ended by an error another process takes the rest.
     """
-    by_path = {t.path: t for t in truths}
-    references = {t.path: t.reference for t in truths if t.reference}
-    job = Job(errors=True, references=references, time_limit=time_limit, keep_going=True)
+    by_path = {case["path"]: case for case in cases}
+    references = {path: case["reference"] for path, case in by_path.items() if case["reference"]}
+    job = replace(job, errors=True, references=references, keep_going=True)
 
     def fits(system: str, variant: Variant) -> bool:
-        return variant.fits(by_path[system].fields)
+        return variant.fits(by_path[system]["fields"])
 
-    processes = measure_all(list(by_path), chosen, job, ranks=ranks, fits=fits, batch=True, mpiexec=mpiexec)
-    for records in processes:
+    for records in measure_all(list(by_path), chosen, job, ranks=ranks, fits=fits, batch=True):
         found = [judge(by_path[record["scene"]], record) for record in records]
-        numbers = Counter(f.outcome for f in found)
-        words = ", ".join(f"{n} {outcome}" for outcome, n in numbers.items())
-        say(f"{found[0].file} on {found[0].ranks} rank{'s' if found[0].ranks > 1 else ''}: {words}")
+        words = ", ".join(f"{n} {outcome}" for outcome, n in Counter(f["outcome"] for f in found).items())
+        _say(f"{found[0]['file']}{_on(found[0]['ranks'])}: {words}")
         yield from found
 
 
-def judge(truth: Truth, record: Record) -> Finding:
+def judge(case: Case, record: Record) -> Finding:
     """What a record of `petsc_fs.tools.measure.measure_all` amounts to."""
-    allowed = {f: UNCONDITIONED for f in truth.fields}
-    allowed |= {f: min(WORST, SAFETY * TOLERANCE * max(c, 1.0)) for f, c in truth.conditions.items()}
+    allowed = dict.fromkeys(case["fields"], UNCONDITIONED)
+    allowed |= {f: min(WORST, SAFETY * TOLERANCE * max(c, 1.0)) for f, c in case["conditions"].items()}
     errors, kind = record["error_by_field"], record["kind"]
     if kind in ("hang", "crash"):
         outcome = kind
     elif kind != "converged":
         outcome = "refusal"
-    elif not truth.solvable:
+    elif not case["solvable"]:
         outcome = "wrong"
-    elif errors is not None and truth.reference:
+    elif errors is not None and case["reference"]:
         outcome = "right" if all(errors[f] <= allowed[f] for f in errors) else "wrong"
     else:
         backward = (record["backward_error"] or {}).get("fieldwise", np.inf)
         outcome = "right" if backward <= SINGULAR_BACKWARD else "wrong"
     said = {key: record[key] for key in "ranks kind message iterations reason error_by_field backward_error".split()}
     seconds = None if record["seconds"] is None else seconds_of(record)["total"]
-    return Finding(truth.name, record["variant"], outcome=outcome, allowed_by_field=allowed, seconds=seconds, **said)
+    about = {"case": case["name"], "file": record["variant"], "outcome": outcome}
+    return about | said | {"allowed_by_field": allowed, "seconds": seconds}
 
 
-def report(truths: Sequence[Truth], findings: Sequence[Finding], command: str) -> dict[str, Any]:
-    """Everything, for JSON."""
-    cases = [{k: v for k, v in asdict(t).items() if k not in ("path", "reference")} for t in truths]
-    return _counted({"command": command, "cases": cases, "findings": [asdict(f) for f in findings]})
-
-
-def _counted(found: dict[str, Any]) -> dict[str, Any]:
-    """With the number of each outcome by number of ranks."""
-    numbers = sorted({f["ranks"] for f in found["findings"]})
-    counts = {str(n): dict(Counter(f["outcome"] for f in found["findings"] if f["ranks"] == n)) for n in numbers}
-    return found | {"counts": counts}
+def report(cases: Iterable[Case], findings: Iterable[Finding], command: str) -> dict[str, Any]:
+    """Everything, for JSON, with the number of each outcome by number of ranks."""
+    known = [{k: v for k, v in case.items() if k not in ("path", "reference")} for case in cases]
+    found = list(findings)
+    numbers = sorted({f["ranks"] for f in found})
+    counts = {str(n): dict(Counter(f["outcome"] for f in found if f["ranks"] == n)) for n in numbers}
+    return {"command": command, "cases": known, "findings": found, "counts": counts}
 
 
 def merge(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Several reports as one; where two have the same case, file and ranks, the later one counts."""
     cases = {case["name"]: case for part in parts for case in part["cases"]}
     latest = {(f["file"], f["ranks"], f["case"]): f for part in parts for f in part["findings"]}
-    command = "; ".join(dict.fromkeys(p["command"] for p in parts))
-    return _counted({"command": command, "cases": list(cases.values()), "findings": list(latest.values())})
+    return report(cases.values(), latest.values(), "; ".join(dict.fromkeys(p["command"] for p in parts)))
 
 
 def read_report(path: Path) -> dict[str, Any]:
-    """A report as `--report` wrote it.
-
-    Raises:
-        UsageError: it is none.
-    """
+    """A report as `--report` wrote it; a UsageError where it is none."""
     try:
         found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         if not {"command", "cases", "findings"} <= set(found):
@@ -228,18 +190,7 @@ def read_report(path: Path) -> dict[str, Any]:
 
 
 def write_page(found: Mapping[str, Any], target: Path) -> list[Path]:
-    """Write a page in Markdown, and beside it the picture that it shows: cases by files, coloured by outcome.
-
-    Args:
-        found: what `report` gives.
-        target: page; the picture is called like it.
-
-    Returns:
-        Both files.
-
-    Raises:
-        UsageError: matplotlib is missing, or a file cannot be written.
-    """
+    """Write a report as a page in Markdown, and beside it, called like it, the picture that it shows; both files."""
     from petsc_fs.tools.plots import plot_matrix
 
     picture = plot_matrix(found["cases"], found["findings"], list(OUTCOMES), target.with_suffix(".png"))
@@ -256,11 +207,8 @@ def write_page(found: Mapping[str, Any], target: Path) -> list[Path]:
         f"![Outcome of each case with each options file]({picture.name})",
         "",
     ]
-    for title, mine in (
-        ("Catalogue", [f for f in found["findings"] if f["case"] not in held]),
-        ("Held out", [f for f in found["findings"] if f["case"] in held]),
-    ):
-        if mine:
+    for title, drawn in (("Catalogue", False), ("Held out", True)):
+        if mine := [f for f in found["findings"] if (f["case"] in held) == drawn]:
             lines += [f"## {title}: {len({f['case'] for f in mine})} cases", "", *markdown(*_by_file(mine)), ""]
     lines += ["## Cases", "", *markdown(*_cases(found)), ""]
     lines += [f"Condition: of the worst field. Iterations and error: of {DEFAULT}."]
@@ -311,16 +259,17 @@ count as none of these."""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `petsc-fs stress`."""
     parser.epilog = EPILOG
-    parser.add_argument("--suite", choices=SUITES, default="quick", help="default %(default)s")
-    parser.add_argument("--ranks", type=int, nargs="+", metavar="N", help="numbers of ranks, as -n; default 1")
-    parser.add_argument("--only", nargs="+", metavar="CASE", help="these cases instead of a suite")
-    parser.add_argument("--files", nargs="+", metavar="FILE", help=f"these options files only; also {DEFAULT}, {RETRY}")
-    parser.add_argument("--list", action="store_true", help="print the catalogue and end")
-    parser.add_argument("--report", type=Path, metavar="FILE.json", help="write everything that was found")
-    parser.add_argument("--read", type=Path, nargs="+", metavar="FILE.json", help="read reports instead of solving")
-    parser.add_argument("--page", type=Path, metavar="FILE.md", help="write it as a page, with a picture beside it")
-    parser.add_argument("--time-limit", type=float, default=60.0, metavar="S", help="of one solve; default %(default)s")
-    parser.add_argument("--mpiexec", metavar="PROGRAM", help="that starts ranks")
+    add = parser.add_argument
+    add("--suite", choices=SUITES, default="quick", help="default %(default)s")
+    add("--ranks", type=positive(int), nargs="+", metavar="N", help="numbers of ranks, as -n; default 1")
+    add("--only", nargs="+", metavar="CASE", help="these cases instead of a suite")
+    add("--files", nargs="+", metavar="FILE", help=f"these options files only; also {DEFAULT}, {RETRY}")
+    add("--list", action="store_true", help="print the catalogue and end")
+    add("--report", type=Path, metavar="FILE.json", help="write everything that was found")
+    add("--read", type=Path, nargs="+", metavar="FILE.json", help="read reports instead of solving")
+    add("--page", type=Path, metavar="FILE.md", help="write it as a page, with a picture beside it")
+    add("--time-limit", type=positive(float), default=60.0, metavar="S", help="of one solve; default %(default)s")
+    add("--mpiexec", metavar="PROGRAM", help="that starts ranks")
 
 
 def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
@@ -347,19 +296,19 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
             if name not in known:
                 raise UsageError(f"no options file {name!r}; there are {', '.join(known)}")
         with tempfile.TemporaryDirectory(prefix="petsc_fs-stress-") as folder:
-            truths = prepare(cases, Path(folder))
-            _say(f"{len(truths)} scenes, {sum(bool(t.reference) for t in truths)} with a reference solution")
-            how: dict[str, Any] = {"time_limit": args.time_limit, "mpiexec": args.mpiexec, "say": _say}
-            findings = list(run(truths, [known[n] for n in args.files or known], ranks=ranks, **how))
+            prepared = prepare(cases, Path(folder))
+            _say(f"{len(prepared)} scenes, {sum(bool(c['reference']) for c in prepared)} with a reference solution")
+            job = Job(time_limit=args.time_limit, mpiexec=args.mpiexec)
+            findings = list(run(prepared, [known[n] for n in args.files or known], job, ranks))
         words = f"--only {' '.join(args.only)}" if args.only else f"--suite {args.suite}"
-        found = report(truths, findings, f"petsc-fs stress {words} --ranks {' '.join(map(str, ranks))}")
+        found = report(prepared, findings, f"petsc-fs stress {words} --ranks {' '.join(map(str, ranks))}")
     if args.report is not None:
         write_text(args.report, json.dumps(found, indent=1) + "\n")
     if args.page is not None:
         write_page(found, args.page)
     bad = [f for f in found["findings"] if f["outcome"] not in ("right", "refusal")]
     for finding in bad:
-        _say(f"{finding['outcome'].upper()}: {describe(Finding(**finding))}")
+        _say(f"{finding['outcome'].upper()}: {describe(finding)}")
     for n, counts in found["counts"].items():
         _say(f"{n} rank{'s' if n != '1' else ''}: " + ", ".join(f"{counts.get(o, 0)} {o}" for o in OUTCOMES))
     seconds = time.perf_counter() - started
@@ -369,20 +318,15 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
 
 def describe(finding: Finding) -> str:
     """One line on what is wrong with a finding."""
-    worst = ""
-    if finding.error_by_field:
-        off = {f: e for f, e in finding.error_by_field.items() if not e <= finding.allowed_by_field.get(f, np.inf)}
-        worst = ", ".join(f"{f} {e:.1e} (allowed {finding.allowed_by_field[f]:.1e})" for f, e in off.items())
-    where = f"{finding.case} by {finding.file} on {finding.ranks}"
-    return f"{where}: {finding.kind} {finding.reason or ''} {finding.message} {worst}".rstrip()
+    allowed, errors = finding["allowed_by_field"], finding["error_by_field"] or {}
+    off = {f: e for f, e in errors.items() if not e <= allowed.get(f, np.inf)}
+    worst = ", ".join(f"{f} {e:.1e} (allowed {allowed[f]:.1e})" for f, e in off.items())
+    where = f"{finding['case']} by {finding['file']} on {finding['ranks']}"
+    return f"{where}: {finding['kind']} {finding['reason'] or ''} {finding['message']} {worst}".rstrip()
 
 
 def _chosen(args: argparse.Namespace) -> list[StressCase]:
-    """The cases of a call.
-
-    Raises:
-        UsageError: there is no such case.
-    """
+    """The cases of a call; a UsageError where there is no such case."""
     known = {case.name: case for case in [*catalogue(), *held_out()]}
     for name in args.only or ():
         if name not in known:
@@ -393,6 +337,10 @@ def _chosen(args: argparse.Namespace) -> list[StressCase]:
     if args.suite == "held-out":
         return [case for case in known.values() if case.held_out]
     return [case for case in known.values() if args.suite == "full" or case.quick]
+
+
+def _on(ranks: int) -> str:
+    return f" on {ranks} rank{'s' if ranks > 1 else ''}"
 
 
 def _say(line: str) -> None:

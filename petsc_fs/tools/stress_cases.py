@@ -1,7 +1,7 @@
 """The catalogue of extreme cases: how each scene is made, what makes it hard, and where it comes from.
 
 Two kinds of scenes: those that PorePy exports by a `Recipe` (bundled in one file, `COLLECTION`, and made anew by
-`scripts/stress_scenes`), and those that a function here makes of another one. A case names the one or the other.
+`scripts/stress_scenes`), and those that a function here makes of another one, as `transformed.json` says.
 
 Some cases are held out: drawn at random, by number, after all thresholds had been chosen on the others, so that nobody
 has picked them, and none is left out. Models with random parameters, all at once, around random fractures; and scenes
@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import lzma
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
@@ -24,56 +24,51 @@ from numpy.typing import NDArray
 
 from petsc_fs.errors import SceneError
 from petsc_fs.io import hdf5
-from petsc_fs.scene import CSR, Scene
+from petsc_fs.scene import CSR, Scene, gather_rows
 from petsc_fs.tools.reference import rows_of
 
 COLLECTION = Path(__file__).resolve().parent.parent / "scenes" / "stress" / "scenes.h5.xz"
 """Compressed HDF5 file of the exported scenes: a group for each, equal arrays stored once."""
 HELD_OUT_COLLECTION = COLLECTION.with_name("held_out.h5.xz")
 """The same for the recipes of `HELD_OUT`."""
+HELD = "held out"
+"""Group of the cases that no threshold was chosen on."""
+
+Change = Callable[[Scene], Scene]
+Factors = Mapping[str, float | NDArray[np.float64]]
+"""Per field a number, or one for each row."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """A linear system of a PorePy model with changed parameters.
+    """A linear system of a PorePy model with changed parameters, see `petsc_fs.porepy.cases`."""
 
-    Attributes:
-        group: heading under which it is listed.
-        hard: what makes it hard, in a line.
-        model: name in `petsc_fs.porepy.cases.CASES`.
-        refinement: cells are 100 m / refinement wide.
-        step: time step, from 1, and Newton step, from 0; the last one before it where Newton's method ends earlier.
-        parameters: of `petsc_fs.porepy.cases.ModelParameters`.
-        rock: of `petsc_fs.porepy.cases.Rock`; also `storage`, 1/M in 1/Pa.
-        case: changes of `petsc_fs.porepy.cases.Case`.
-        twist: changes that no parameter makes, see `scripts/stress_scenes`.
-    """
-
-    group: str
-    hard: str
+    group: str  # heading under which it is listed
+    hard: str  # what makes it hard, in a line
     model: str = "model2"
-    refinement: float = 0.3
-    step: tuple[int, int] = (1, 1)
-    parameters: Mapping[str, Any] = field(default_factory=dict)
-    rock: Mapping[str, Any] = field(default_factory=dict)
-    case: Mapping[str, Any] = field(default_factory=dict)
-    twist: Mapping[str, Any] = field(default_factory=dict)
-
-
-CONTACT, FLOW, UNITS, ALGEBRA, HELD = "contact", "flow", "units", "algebra", "held out"
+    refinement: float = 0.3  # cells are 100 m / refinement wide
+    step: tuple[int, int] = (1, 1)  # time step, from 1, and Newton step, from 0, or the last one before it
+    parameters: Mapping[str, Any] = field(default_factory=dict)  # of `ModelParameters`
+    rock: Mapping[str, Any] = field(default_factory=dict)  # of `Rock`; also `storage`, 1/M in 1/Pa
+    case: Mapping[str, Any] = field(default_factory=dict)  # changes of `Case`
+    twist: Mapping[str, Any] = field(default_factory=dict)  # what no parameter says, see `scripts/stress_scenes`
+    quick: bool = False  # see `StressCase`
 
 
 def _frozen(value: Any) -> Any:
     return tuple(map(_frozen, value)) if isinstance(value, list) else value
 
 
-def _read_recipes() -> dict[str, Recipe]:
-    text = COLLECTION.with_name("recipes.json").read_text(encoding="utf-8")
-    frozen = json.loads(text, object_hook=lambda found: {k: _frozen(v) for k, v in found.items()})
-    return {name: Recipe(**known) for name, known in frozen.items()}
+def _table(name: str) -> dict[str, dict[str, Any]]:
+    """A JSON file beside the scenes, with tuples for lists."""
+    text = COLLECTION.with_name(name).read_text(encoding="utf-8")
+    found: dict[str, dict[str, Any]] = json.loads(
+        text, object_hook=lambda entry: {k: _frozen(v) for k, v in entry.items()}
+    )
+    return found
 
 
-ALL_RECIPES = _read_recipes()
+ALL_RECIPES = {name: Recipe(**known) for name, known in _table("recipes.json").items()}
 RECIPES = {name: recipe for name, recipe in ALL_RECIPES.items() if recipe.group != HELD}
 """Name of an exported scene to what it is made by."""
 HELD_OUT = {name: recipe for name, recipe in ALL_RECIPES.items() if recipe.group == HELD}
@@ -93,11 +88,7 @@ def _unpacked(path: Path) -> Any:
 
 
 def load(name: str) -> Scene:
-    """A scene by name: of a recipe, or of a bundled file such as `model1.h5`.
-
-    Raises:
-        SceneError: there is none.
-    """
+    """A scene by name: of a recipe, or of a bundled file such as `model1.h5`; a SceneError where there is none."""
     if name.endswith(".h5"):
         return hdf5.read(COLLECTION.parent.parent / name)
     path = COLLECTION if name in RECIPES else HELD_OUT_COLLECTION
@@ -107,17 +98,17 @@ def load(name: str) -> Scene:
         return hdf5.read_group(file[name])
 
 
-Rows = Mapping[str, float | NDArray[np.float64]]
+# --- changes of scenes, which transformed.json calls by name
 
 
-def scaled(scene: Scene, rows: Rows | None = None, columns: Rows | None = None) -> Scene:
-    """Equations multiplied by `rows` and unknowns by `columns`, each a number or an array per field."""
+def scaled(scene: Scene, rows: Factors | None = None, columns: Factors | None = None) -> Scene:
+    """Equations multiplied by `rows` and unknowns by `columns`."""
     left, right = dict(rows or {}), dict(columns or {})
     blocks = {}
     for (r, c), block in scene.blocks.items():
-        factor = np.repeat(np.broadcast_to(left.get(r, 1.0), scene.sizes[r]), np.diff(block.indptr))
+        factor = np.broadcast_to(left.get(r, 1.0), scene.sizes[r])[rows_of(block)]
         below = np.broadcast_to(right.get(c, 1.0), scene.sizes[c])[block.indices]
-        blocks[r, c] = CSR(block.indptr, block.indices, block.data * factor / below)
+        blocks[r, c] = block._replace(data=block.data * factor / below)
     rhs = {f: v * left.get(f, 1.0) for f, v in scene.rhs.items()}
     return replace(scene, blocks=blocks, rhs=rhs, reference={})
 
@@ -143,32 +134,44 @@ def in_units(scene: Scene, *, kg: float = 1.0, m: float = 1.0, s: float = 1.0) -
     mass, length, time = base_units(scene, kg, m, s)
     force, pressure = mass * length / time**2, mass / length / time**2
     rows = {"intf_force": force, "momentum": force, "intf_flow": length**3 / time, "mass": mass / time}
-    found = scaled(scene, rows, unknowns_in_units(scene, kg=kg, m=m, s=s))
-    if found.material is not None:
-        old = found.material
-        found.material = replace(
-            old,
-            shear_modulus=np.asarray(old.shear_modulus) * pressure,
-            lame_lambda=np.asarray(old.lame_lambda) * pressure,
-            fluid_compressibility=np.asarray(old.fluid_compressibility) / pressure,
-            fluid_density=np.asarray(old.fluid_density) * mass / length**3,
-            normal_jump=np.asarray(old.normal_jump) * length,
-            time_step=old.time_step * time,
-        )
-    found.cell_volumes = {f: v * length**3 for f, v in found.cell_volumes.items()}
-    found.cell_centers = {f: v * length for f, v in found.cell_centers.items()}
-    found.metadata = replace(found.metadata, units={"kg": kg, "m": m, "s": s})
-    return found
+    found = with_material(
+        scaled(scene, rows, unknowns_in_units(scene, kg=kg, m=m, s=s)),
+        shear_modulus=pressure,
+        lame_lambda=pressure,
+        fluid_compressibility=1 / pressure,
+        fluid_density=mass / length**3,
+        normal_jump=length,
+        time_step=time,
+    )
+    return replace(
+        found,
+        cell_volumes={f: v * length**3 for f, v in scene.cell_volumes.items()},
+        cell_centers={f: v * length for f, v in scene.cell_centers.items()},
+        metadata=replace(scene.metadata, units={"kg": kg, "m": m, "s": s}),
+    )
 
 
-def scattered(scene: Scene, field_name: str, decades: float, seed: int = 3) -> Scene:
-    """The equations of a field multiplied cell by cell by numbers over so many decades."""
-    cells = scene.sizes[field_name] // scene.block_size(field_name)
+def with_material(scene: Scene, **factors: float) -> Scene:
+    """Material data multiplied by factors, where there are any; only the fixed-stress diagonal looks at them."""
+    if scene.material is None:
+        return scene
+    values: dict[str, Any] = {k: np.asarray(getattr(scene.material, k)) * v for k, v in factors.items()}
+    if "time_step" in values:
+        values["time_step"] = float(values["time_step"])
+    return replace(scene, material=replace(scene.material, **values), reference={})
+
+
+def scattered(
+    scene: Scene, name: str, decades: float, seed: int | np.random.Generator = 3, *, unknowns: bool = False
+) -> Scene:
+    """The equations, or the unknowns, of a field multiplied cell by cell by numbers over so many decades."""
+    cells = scene.sizes[name] // scene.block_size(name)
     factors = 10.0 ** (decades * (np.random.default_rng(seed).random(cells) - 0.5))
-    return scaled(scene, {field_name: np.repeat(factors, scene.block_size(field_name))})
+    by_row = {name: np.repeat(factors, scene.block_size(name))}
+    return scaled(scene, columns=by_row) if unknowns else scaled(scene, by_row)
 
 
-def with_rhs(scene: Scene, fields: tuple[str, ...] = ()) -> Scene:
+def with_rhs(scene: Scene, fields: Sequence[str] = ()) -> Scene:
     """A right-hand side that is zero but for some fields, where it is random if it was zero."""
     random = np.random.default_rng(5)
     rhs = {}
@@ -178,44 +181,40 @@ def with_rhs(scene: Scene, fields: tuple[str, ...] = ()) -> Scene:
     return replace(scene, rhs=rhs, reference={})
 
 
-def with_rows_of(scene: Scene, other: Scene, cells: list[int]) -> Scene:
-    """The contact conditions of some fracture cells taken from another scene on the same grid."""
-    D, blocks, rhs = scene.dimension, dict(scene.blocks), {f: v.copy() for f, v in scene.rhs.items()}
-    rows = np.concatenate([np.arange(D * k, D * k + D) for k in cells])
-    taken = np.zeros(scene.sizes["contact"], dtype=bool)
-    taken[rows] = True
+def with_rhs_scaled(scene: Scene, factor: float) -> Scene:
+    """A right-hand side times a number."""
+    return replace(scene, rhs={f: factor * v for f, v in scene.rhs.items()}, reference={})
+
+
+def taken(block: CSR, rows: NDArray[np.int64]) -> CSR:
+    """Some rows of a block, in the order given."""
+    at, counts = gather_rows(block.indptr, rows)
+    return CSR(np.concatenate([[0], np.cumsum(counts)]), block.indices[at], block.data[at])
+
+
+def with_cells_of(scene: Scene, other: str, cells: Sequence[int]) -> Scene:
+    """The contact conditions of some fracture cells taken from another scene, by name, on the same grid."""
+    there, n = load(other), scene.sizes["contact"]
+    blocks, rhs = dict(scene.blocks), {f: v.copy() for f, v in scene.rhs.items()}
+    swapped = np.isin(np.arange(n) // scene.dimension, cells)
+    nothing = CSR(np.zeros(n + 1, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))
     for f in scene.fields:
-        mine, theirs = (s.blocks.get(("contact", f)) for s in (scene, other))
-        parts = [(b, keep) for b, keep in ((mine, ~taken), (theirs, taken)) if b is not None]
-        if parts:
-            blocks["contact", f] = _rows_together(parts, taken.size)
-    rhs["contact"][taken] = other.rhs["contact"][taken]
-    assert scene.contact_state is not None and other.contact_state is not None
-    state = np.array(scene.contact_state)
-    state[cells] = np.asarray(other.contact_state)[cells]
+        mine, theirs = (s.blocks.get(("contact", f), nothing) for s in (scene, there))
+        indptr = np.concatenate([mine.indptr, mine.indptr[-1] + theirs.indptr[1:]])
+        indices, data = (np.concatenate([getattr(b, part) for b in (mine, theirs)]) for part in ("indices", "data"))
+        both = CSR(indptr, indices, data)
+        if both.data.size:
+            blocks["contact", f] = taken(both, np.arange(n) + n * swapped)
+    rhs["contact"][swapped] = there.rhs["contact"][swapped]
+    assert scene.contact_state is not None and there.contact_state is not None
+    state = np.where(np.isin(np.arange(n // scene.dimension), cells), there.contact_state, scene.contact_state)
     return replace(scene, blocks=blocks, rhs=rhs, contact_state=state, reference={})
-
-
-def _rows_together(parts: list[tuple[CSR, NDArray[np.bool_]]], n: int) -> CSR:
-    """Rows of several blocks, each with the rows that it gives."""
-    rows, columns, data = [], [], []
-    for block, keep in parts:
-        row = rows_of(block)
-        chosen = keep[row]
-        rows.append(row[chosen])
-        columns.append(np.asarray(block.indices)[chosen])
-        data.append(block.data[chosen])
-    row = np.concatenate(rows)
-    order = np.argsort(row, kind="stable")
-    indptr = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=n))])
-    return CSR(indptr, np.concatenate(columns)[order], np.concatenate(data)[order])
 
 
 def with_block_of_cell(scene: Scene, name: str, cell: int, factor: float) -> Scene:
     """The diagonal block of one cell multiplied by a factor."""
     block, bs = scene.blocks[name, name], scene.block_size(name)
-    row = rows_of(block)
-    inside = (row // bs == cell) & (np.asarray(block.indices) // bs == cell)
+    inside = (rows_of(block) // bs == cell) & (np.asarray(block.indices) // bs == cell)
     data = np.where(inside, factor * block.data, block.data)
     return replace(scene, blocks={**scene.blocks, (name, name): block._replace(data=data)}, reference={})
 
@@ -229,25 +228,12 @@ def without_row(scene: Scene, name: str, row: int) -> Scene:
 
 def with_row_twice(scene: Scene, name: str, *, consistent: bool) -> Scene:
     """The first equation of a field in place of its second too; the right-hand sides agree or do not."""
-    blocks = dict(scene.blocks)
-    for (r, c), block in scene.blocks.items():
-        if r == name:
-            source = np.arange(scene.sizes[name])
-            source[1] = 0
-            counts = np.diff(block.indptr)[source]
-            take = np.concatenate([np.arange(block.indptr[k], block.indptr[k + 1]) for k in source])
-            indptr = np.concatenate([[0], np.cumsum(counts)])
-            blocks[r, c] = CSR(indptr, np.asarray(block.indices)[take], block.data[take])
+    source = np.arange(scene.sizes[name])
+    source[1] = 0
+    blocks = {rc: taken(block, source) if rc[0] == name else block for rc, block in scene.blocks.items()}
     rhs = {f: v.copy() for f, v in scene.rhs.items()}
     rhs[name][1] = rhs[name][0] + (0.0 if consistent else max(1.0, float(np.abs(rhs[name]).max())))
     return replace(scene, blocks=blocks, rhs=rhs, reference={})
-
-
-def with_material(scene: Scene, **changed: Any) -> Scene:
-    """Other material data, which only the fixed-stress diagonal looks at."""
-    assert scene.material is not None
-    values = {k: np.asarray(getattr(scene.material, k)) * v if k != "time_step" else v for k, v in changed.items()}
-    return replace(scene, material=replace(scene.material, **values), reference={})
 
 
 def without_data(scene: Scene) -> Scene:
@@ -255,42 +241,31 @@ def without_data(scene: Scene) -> Scene:
     return replace(scene, material=None, cell_volumes={}, cell_centers={}, cell_dimension=None, reference={})
 
 
-def with_rhs_scaled(scene: Scene, factor: float) -> Scene:
-    """A right-hand side times a number."""
-    return replace(scene, rhs={f: factor * v for f, v in scene.rhs.items()}, reference={})
+NAMED: dict[str, Callable[..., Scene]] = {
+    change.__name__: change
+    for change in (
+        *(scaled, in_units, with_material, scattered, with_rhs, with_rhs_scaled, with_cells_of),
+        *(with_block_of_cell, without_row, with_row_twice, without_data),
+    )
+}
+"""Changes by name."""
 
 
-def with_cells_of(scene: Scene, other: str, cells: list[int]) -> Scene:
-    """See `with_rows_of`; the other scene by name."""
-    return with_rows_of(scene, load(other), cells)
+# --- cases
 
 
 @dataclass(frozen=True, kw_only=True)
 class StressCase:
-    """One extreme scene.
-
-    Attributes:
-        name: of the case.
-        group: heading under which it is listed.
-        hard: what makes it hard, in a line.
-        source: where it comes from, in words.
-        make: the scene.
-        singular: whether the matrix is singular, so that no solution or no single one exists.
-        solvable: whether there is a solution, so that one that is handed on can be right.
-    """
+    """One extreme scene."""
 
     name: str
-    group: str
-    hard: str
-    source: str
+    group: str  # heading under which it is listed
+    hard: str  # what makes it hard, in a line
+    source: str  # where it comes from, in words
     make: Callable[[], Scene]
-    singular: bool = False
-    solvable: bool = True
-
-    @property
-    def quick(self) -> bool:
-        """Whether `--suite quick` has it."""
-        return self.name in QUICK
+    quick: bool = False  # whether `--suite quick` has it
+    singular: bool = False  # whether the matrix is singular, so that no solution or no single one exists
+    solvable: bool = True  # whether there is a solution, so that one that is handed on can be right
 
     @property
     def held_out(self) -> bool:
@@ -301,111 +276,24 @@ class StressCase:
     def exported(cls, name: str, recipe: Recipe) -> StressCase:
         """A case that a PorePy model was exported for."""
         source = f"PorePy, {recipe.model}, step {recipe.step[0]}:{recipe.step[1]}"
-        return cls(name=name, group=recipe.group, hard=recipe.hard, source=source, make=partial(load, name))
+        known: dict[str, Any] = {"group": recipe.group, "hard": recipe.hard, "source": source}
+        return cls(name=name, make=partial(load, name), quick=recipe.quick, **known)
 
-
-QUICK = (
-    "base", "friction_0", "kn_1.2e20", "open", "sliding", "contact_constant_1e6", "permeability_1e-22", "lognormal",
-    "poisson_0.4999", "stiffness_1e6", "biot_0", "no_storage", "undrained_saddle", "time_step_1e10", "slivers",
-    "cut_through", "units_SI_base", "units_mm_h_base", "units_SI_flow", "zero_equation", "contradiction", "zero_rhs",
-)  # fmt: skip
-
-
-Change = Callable[[Scene], Scene]
-
-
-def _transformed() -> list[StressCase]:
-    """Cases made of other scenes."""
-    rows: list[tuple[str, str, str, str, Change]] = []  # name, group, what is hard, scene, change
-
-    systems: dict[str, dict[str, Any]] = {
-        "SI": {}, "mm": {"m": 1e-3}, "h": {"s": 3600.0}, "mm_h": {"kg": 1e10, "m": 1e-3, "s": 3600.0},
-        "km_year": {"kg": 1e10, "m": 1e3, "s": 3.156e7},
-    }  # fmt: skip
-    for label, units in systems.items():
-        hard = f"units {', '.join(f'{k} = {v:g}' for k, v in ({'kg': 1.0, 'm': 1.0, 's': 1.0} | units).items())}"
-        for base in ("base", "model1.h5", "model2.h5"):
-            if base != "model2.h5" or label in ("mm", "h"):
-                rows.append(
-                    (f"units_{label}_{base.removesuffix('.h5')}", UNITS, hard, base, partial(in_units, **units))
-                )
-    # fmt: off
-    for base in ("biot.h5", "flow.h5", "contact.h5", "three_planes"):
-        rows.append((f"units_SI_{base.removesuffix('.h5')}", UNITS, "SI units", base, partial(in_units)))
-    for base in ("flow", "biot"):
-        change = partial(in_units, m=1e-3, s=3600.0)
-        rows.append((f"units_mm_h_{base}", UNITS, "mm and hours", f"{base}.h5", change))
-    for power in (-8, 8):
-        factor = 10.0**power
-        hides = "is all there is" if power > 0 else "hides behind the others"
-        rows += [
-            (f"traction_1e{power}", CONTACT, f"traction counted in units of 1e{-power}", "base",
-             partial(scaled, columns={"contact": factor})),
-            (f"contact_rows_1e{power}", ALGEBRA, f"contact conditions multiplied by 1e{power}", "base",
-             partial(scaled, rows={"contact": factor})),
-            (f"mass_rows_1e{power}", ALGEBRA, f"mass balance multiplied by 1e{power}: its residual {hides}", "base",
-             partial(scaled, rows={"mass": factor})),
-        ]
-    rows += [
-        ("force_rows_1e12", ALGEBRA, "balance of forces multiplied by 1e12: all other residuals hide", "base",
-         partial(scaled, rows={"intf_force": 1e12, "momentum": 1e12})),
-        ("flow_rows_scattered", ALGEBRA, "Darcy's law of each cell multiplied by a number, over 6 decades", "flow.h5",
-         partial(scattered, field_name="intf_flow", decades=6)),
-        ("mass_rows_scattered", ALGEBRA, "mass balance of each cell multiplied by a number, over 6 decades", "base",
-         partial(scattered, field_name="mass", decades=6)),
-        ("contact_rows_scattered", ALGEBRA, "contact conditions of each cell times a number, over 12 decades", "base",
-         partial(scattered, field_name="contact", decades=12)),
-        ("one_cell_slides", CONTACT, "all cells stick but one, which slides", "sticking",
-         partial(with_cells_of, other="sliding", cells=[7])),
-        ("one_cell_opens", CONTACT, "all cells stick but one, which is open", "sticking",
-         partial(with_cells_of, other="open", cells=[7])),
-        ("every_second_slides", CONTACT, "cells stick and slide in turn", "sticking",
-         partial(with_cells_of, other="sliding", cells=list(range(0, 22, 2)))),
-        ("nearly_singular_d22", CONTACT, "the interface block D_22 of one cell is 1e-13 of the others", "base",
-         partial(with_block_of_cell, name="intf_force", cell=3, factor=1e-13)),
-        ("nearly_zero_j44", FLOW, "one diagonal entry of J_44 is 1e-13 of the others", "base",
-         partial(with_block_of_cell, name="intf_flow", cell=3, factor=1e-13)),
-        ("zero_j44", FLOW, "one diagonal entry of J_44 is zero, the matrix is not singular", "base",
-         partial(with_block_of_cell, name="intf_flow", cell=3, factor=0.0)),
-        ("wrong_time_step", ALGEBRA, "material data with a time step 1e6 too long: fixed stress hardly acts", "base",
-         partial(with_material, time_step=900.0 * 1e6)),
-        ("wrong_stiffness", ALGEBRA, "material data with a stiffness 1e6 too small: fixed stress overwhelms", "base",
-         partial(with_material, shear_modulus=1e-6, lame_lambda=1e-6)),
-        ("without_data", ALGEBRA, "no material data, no geometry", "base", without_data),
-        ("zero_rhs", ALGEBRA, "right-hand side zero", "base", partial(with_rhs)),
-        ("only_mass_driven", ALGEBRA, "only the mass balance has a right-hand side", "base",
-         partial(with_rhs, fields=("mass",))),
-        ("only_contact_driven", ALGEBRA, "only the contact conditions have a right-hand side", "base",
-         partial(with_rhs, fields=("contact",))),
-        ("tiny_rhs", ALGEBRA, "right-hand side of 1e-150: absolute tolerances are met at once", "base",
-         partial(with_rhs_scaled, factor=1e-150)),
-        ("huge_rhs", ALGEBRA, "right-hand side of 1e160: squares overflow", "base",
-         partial(with_rhs_scaled, factor=1e160)),
-        ("small_rhs", ALGEBRA, "a late Newton step: right-hand side 1e-12 of the first", "base",
-         partial(with_rhs_scaled, factor=1e-12)),
-        ("zero_equation", ALGEBRA, "one equation is lost: singular", "base", partial(without_row, name="mass", row=5)),
-        ("contradiction", ALGEBRA, "the same equation twice with different right-hand sides: no solution", "base",
-         partial(with_row_twice, name="mass", consistent=False)),
-        ("repetition", ALGEBRA, "the same equation twice: many solutions", "base",
-         partial(with_row_twice, name="mass", consistent=True)),
-    ]
-    # fmt: on
-    return [
-        StressCase(
-            name=name,
-            group=group,
-            hard=hard,
-            source=f"{base}, {(change.func if isinstance(change, partial) else change).__name__}",
-            make=partial(_changed, base, change),
-            singular=name in ("zero_equation", "contradiction", "repetition"),
-            solvable=name != "contradiction",
-        )
-        for name, group, hard, base, change in rows
-    ]
+    @classmethod
+    def transformed(cls, name: str, base: str, change: str, **known: Any) -> StressCase:
+        """A case made of another scene by one of `NAMED`, with the arguments in `with`."""
+        make = partial(_changed, base, partial(NAMED[change], **known.pop("with", {})))
+        return cls(name=name, source=f"{base}, {change}", make=make, **known)
 
 
 def _changed(base: str, change: Change) -> Scene:
     return change(load(base))
+
+
+def catalogue() -> list[StressCase]:
+    """All cases but those held out, exported scenes first."""
+    exported = [StressCase.exported(name, recipe) for name, recipe in RECIPES.items()]
+    return exported + [StressCase.transformed(name, **known) for name, known in _table("transformed.json").items()]
 
 
 SEED = 20250131
@@ -417,20 +305,29 @@ BASES = (
 """What is transformed: bundled scenes and exported ones."""
 
 
-def drawn_changes(number: int) -> tuple[list[str], Change]:
-    """The two or three random changes of a held-out case: in words, and what makes them."""
+def held_out() -> list[StressCase]:
+    """All held-out cases."""
+    found = [StressCase.exported(name, recipe) for name, recipe in HELD_OUT.items()]
+    for k in range(TRANSFORMED):
+        base = BASES[k % len(BASES)]
+        known: dict[str, Any] = {"name": f"held_out_{base.removesuffix('.h5')}_{k:02}", "hard": "; ".join(_drawn(k)[0])}
+        make = partial(_changed, base, partial(_drawn_change, number=k))
+        found.append(StressCase(group=HELD, source=f"{base}, random changes", make=make, **known))
+    return found
 
-    def change(scene: Scene) -> Scene:
-        random = np.random.default_rng([SEED, 1000 + number])
-        for name in names(random):
-            scene = CHANGES[name](scene, random)
-        return scene
 
-    def names(random: np.random.Generator) -> list[str]:
-        shuffled: list[str] = random.permutation(list(CHANGES)).tolist()
-        return shuffled[: int(random.integers(2, 4))]
+def _drawn(number: int) -> tuple[list[str], np.random.Generator]:
+    """The two or three random changes of a held-out case, of `CHANGES`, and what draws their numbers."""
+    random = np.random.default_rng([SEED, 1000 + number])
+    shuffled: list[str] = random.permutation(list(CHANGES)).tolist()
+    return shuffled[: int(random.integers(2, 4))], random
 
-    return names(np.random.default_rng([SEED, 1000 + number])), change
+
+def _drawn_change(scene: Scene, number: int) -> Scene:
+    names, random = _drawn(number)
+    for name in names:
+        scene = CHANGES[name](scene, random)
+    return scene
 
 
 def _units(scene: Scene, random: np.random.Generator) -> Scene:
@@ -438,12 +335,9 @@ def _units(scene: Scene, random: np.random.Generator) -> Scene:
     return in_units(scene, kg=float(kg), m=float(m), s=float(s))
 
 
-def _rows(scene: Scene, random: np.random.Generator) -> Scene:
-    return scaled(scene, rows={f: float(10.0 ** random.uniform(-4, 4)) for f in scene.fields})
-
-
-def _columns(scene: Scene, random: np.random.Generator) -> Scene:
-    return scaled(scene, columns={f: float(10.0 ** random.uniform(-6, 6)) for f in scene.fields})
+def _powers(scene: Scene, random: np.random.Generator, decades: float) -> dict[str, float]:
+    """A number for each field."""
+    return {f: float(10.0 ** random.uniform(-decades, decades)) for f in scene.fields}
 
 
 def _scattered_rows(scene: Scene, random: np.random.Generator) -> Scene:
@@ -453,19 +347,12 @@ def _scattered_rows(scene: Scene, random: np.random.Generator) -> Scene:
 
 def _scattered_columns(scene: Scene, random: np.random.Generator) -> Scene:
     name = str(random.choice(scene.fields))
-    cells = scene.sizes[name] // scene.block_size(name)
-    factors = 10.0 ** (random.uniform(1, 3) * (random.random(cells) - 0.5))
-    return scaled(scene, columns={name: np.repeat(factors, scene.block_size(name))})
+    return scattered(scene, name, decades=float(random.uniform(1, 3)), seed=random, unknowns=True)
 
 
 def _rhs(scene: Scene, random: np.random.Generator) -> Scene:
     rhs = {f: random.standard_normal(v.size) * (np.linalg.norm(v) or 1.0) for f, v in scene.rhs.items()}
     return replace(scene, rhs=rhs, reference={})
-
-
-def _rhs_scaled(scene: Scene, random: np.random.Generator) -> Scene:
-    factor = float(10.0 ** random.uniform(-60, 60))
-    return with_rhs_scaled(scene, factor)
 
 
 def _material(scene: Scene, random: np.random.Generator) -> Scene:
@@ -477,34 +364,13 @@ def _material(scene: Scene, random: np.random.Generator) -> Scene:
 
 CHANGES: dict[str, Callable[[Scene, np.random.Generator], Scene]] = {
     "random units": _units,
-    "equations of each field times a number over 8 decades": _rows,
-    "unknowns of each field times a number over 12 decades": _columns,
+    "equations of each field times a number over 8 decades": lambda s, r: scaled(s, rows=_powers(s, r, 4)),
+    "unknowns of each field times a number over 12 decades": lambda s, r: scaled(s, columns=_powers(s, r, 6)),
     "equations of one field scattered over 1 to 5 decades": _scattered_rows,
     "unknowns of one field scattered over 1 to 3 decades": _scattered_columns,
     "random right-hand side": _rhs,
-    "right-hand side times a number over 120 decades": _rhs_scaled,
+    "right-hand side times a number over 120 decades": lambda s, r: with_rhs_scaled(
+        s, float(10.0 ** r.uniform(-60, 60))
+    ),
     "stiffness that fixed stress is told off by up to 10": _material,
 }
-
-
-def held_out() -> list[StressCase]:
-    """All held-out cases."""
-    found = [StressCase.exported(name, recipe) for name, recipe in HELD_OUT.items()]
-    for k in range(TRANSFORMED):
-        base = BASES[k % len(BASES)]
-        words, change = drawn_changes(k)
-        found.append(
-            StressCase(
-                name=f"held_out_{base.removesuffix('.h5')}_{k:02}",
-                group=HELD,
-                hard="; ".join(words),
-                source=f"{base}, random changes",
-                make=partial(_changed, base, change),
-            )
-        )
-    return found
-
-
-def catalogue() -> list[StressCase]:
-    """All cases but those held out, exported scenes first."""
-    return [StressCase.exported(name, recipe) for name, recipe in RECIPES.items()] + _transformed()

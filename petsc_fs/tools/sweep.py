@@ -14,24 +14,28 @@ from __future__ import annotations
 import argparse
 import contextlib
 import fcntl
+import itertools
 import json
-import math
 import os
+import re
 import statistics
 import sys
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from petsc_fs import options
 from petsc_fs.errors import SolveError, UsageError
 from petsc_fs.io import hdf5
 from petsc_fs.io.files import write_text
-from petsc_fs.tools import measure
+from petsc_fs.tools import measure, reference
+from petsc_fs.tools.measure import make_folder, positive, say
 from petsc_fs.tools.pages import markdown
 from petsc_fs.tools.space import Space, Value, find_space, label, read
 
@@ -40,6 +44,11 @@ if TYPE_CHECKING:
 
 Summary = dict[str, Any]
 """What was measured on one scene: seconds, iterations, memory (bytes), error, residual."""
+Attempt = dict[str, Any]
+"""One finished trial: its `number`; `values` of its parameters; `outcome`, one of OUTCOMES; `message`, one line on what
+went wrong; `scenes`, by name what was measured, with `ratios` to the base file; `totals` of these by objective,
+aggregated over scenes, if it was solved; `same_as`, the number of an earlier trial of the same options, for which this
+one was not measured again, or None."""
 Results = dict[str, Any]
 
 SAMPLERS = ("tpe", "random", "grid")
@@ -55,16 +64,28 @@ OUTCOMES = {
 }
 """How trials end, and what each means."""
 
+NOTHING: Summary = {"error": None}
+"""Of a base file whose error is not known."""
 ERROR_FACTOR = 10.0
 """A trial may have this many times the error of the base file."""
 SLACK = 3.0
-"""Seconds that any trial has more than that."""
+"""Seconds that any trial has more than `Settings.patience` says."""
 SHORT = 5.0
 """Seconds of a process below which one more solve, unrecorded, goes before in the next ones."""
 RECENT = 3
 """Measurements of the base file, the last ones, whose median a trial is compared with."""
 STARTUP_TRIALS = 20
 """Random trials before TPE has a model to go by."""
+
+
+def _option(default: Any, said: str, **how: Any) -> Any:
+    """A setting that is an option of the command line, too: its default, what it is, and argparse's words for it."""
+    shown = "" if default is None or isinstance(default, tuple) else f" (default {default})"
+    return field(default=default, metadata={"help": said + shown, **how})
+
+
+def _bytes(text: str) -> int:
+    return int(float(text) * 1e9)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,20 +96,25 @@ class Settings:
     space: Space
     out: Path  # folder of the sweep
     hold_out: tuple[Path, ...] = ()  # scenes that only the base file and the best one solve, at the end
-    trials: int = 200  # finished ones of earlier runs included
-    sampler: str = "tpe"  # of SAMPLERS
-    objectives: tuple[str, ...] = ("time", "memory")  # of OBJECTIVES; the first one chooses the best file
-    aggregate: str = "mean"  # of the ratios on several scenes, the geometric mean or the worst
-    ranks: int = 1
-    rtol: float | None = None  # None for that of the base file
-    repetitions: int = 1  # solves of each scene in a trial, of which the median counts
-    time_limit: float = 300.0  # seconds for one solve, with start and set-up
-    memory_limit: int | None = None  # bytes of address space of each rank
-    patience: float = 3.0  # a trial is given up at so many times what the base file takes; 0 for never
-    finalists: int = 3  # files measured again at the end, to choose the best
-    confirm: int = 3  # measurements of each of them, and on the scenes held out
-    clock: str = "wall"  # of petsc_fs.tools.measure.CLOCKS
-    seed: int = 0  # of the sampler
+    # fmt: off
+    trials: int = _option(200, "trials, finished ones included", type=positive(int), metavar="N")
+    sampler: str = _option("tpe", "how values are chosen", choices=SAMPLERS)
+    objective: tuple[str, ...] = _option(("time", "memory"), "what to make small; the first one chooses the best file "
+        "(default time memory)", choices=OBJECTIVES, nargs="+")
+    aggregate: str = _option("mean", "of several scenes, as ratio to the base file", choices=AGGREGATES)
+    ranks: int = _option(1, "MPI ranks of each solve", type=positive(int), metavar="N")
+    rtol: float | None = _option(None, "relative tolerance (default that of the base file)", type=float, metavar="R")
+    repetitions: int = _option(1, "solves of each scene in a trial, of which the median counts", type=positive(int),
+        metavar="N")
+    time_limit: float = _option(300.0, "seconds for one solve, start included", type=positive(float), metavar="S")
+    memory_limit: int | None = _option(None, "address space of each rank", type=_bytes, metavar="GB")
+    patience: float = _option(3.0, "give up a trial at X times what the base file takes; 0: never", type=float,
+        metavar="X")
+    finalists: int = _option(3, "files measured again at the end, to choose the best", type=positive(int), metavar="N")
+    confirm: int = _option(3, "measurements of each of them, and on scenes held out", type=positive(int), metavar="N")
+    clock: str = _option("wall", "cpu: processor time, where others compute, too", choices=measure.CLOCKS)
+    seed: int = _option(0, "of the sampler", type=int, metavar="N")
+    # fmt: on
 
     @property
     def tolerance(self) -> float:
@@ -97,13 +123,12 @@ class Settings:
 
     def identity(self) -> dict[str, str]:
         """What may not change when a sweep goes on."""
-        from petsc_fs.tools.reference import digest
-
         return {
-            "scenes": " ".join(f"{path.name} ({digest(path)[:12]})" for path in self.scenes),
+            "format": "2",  # of what is stored of a trial
+            "scenes": " ".join(f"{path.name} ({reference.digest(path)[:12]})" for path in self.scenes),
             "space": json.dumps([repr(p) for p in self.space.parameters]),
             "base file": self.space.base.read_text(encoding="utf-8"),
-            **{name: str(getattr(self, name)) for name in ("objectives", "aggregate", "ranks", "tolerance", "clock")},
+            **{name: str(getattr(self, name)) for name in ("objective", "aggregate", "ranks", "tolerance", "clock")},
         }
 
 
@@ -113,7 +138,7 @@ def aggregate(ratios: Sequence[float], how: str) -> float:
     >>> aggregate([0.5, 2.0], "mean"), aggregate([0.5, 2.0], "worst")
     (1.0, 2.0)
     """
-    return max(ratios) if how == "worst" else math.exp(statistics.fmean(math.log(max(r, 1e-300)) for r in ratios))
+    return max(ratios) if how == "worst" else statistics.geometric_mean(ratios)
 
 
 def summary(records: Sequence[measure.Record], clock: str = "wall") -> Summary:
@@ -138,7 +163,7 @@ def ratios(mine: Summary, base: Summary) -> dict[str, float]:
     }
 
 
-def judge(records: Sequence[measure.Record], base: Summary) -> tuple[str, str]:
+def judge(records: Sequence[measure.Record], base: Summary = NOTHING) -> tuple[str, str]:
     """Outcome and message of the solves of one scene; the error must not be far above the base file's."""
     bad = next((r for r in records if r["kind"] != "converged"), None)
     if bad is not None:
@@ -155,72 +180,40 @@ def front(points: Sequence[Sequence[float]]) -> list[int]:
     >>> front([(1, 3), (2, 2), (3, 3), (1, 3)])
     [0, 1, 3]
     """
-    return [
-        k
-        for k, p in enumerate(points)
-        if not any(all(b <= a for a, b in zip(p, q, strict=True)) and tuple(q) != tuple(p) for q in points)
-    ]
-
-
-@dataclass(frozen=True)
-class Attempt:
-    """One finished trial."""
-
-    number: int  # of the trial
-    values: dict[str, Value]  # of its parameters
-    outcome: str  # one of OUTCOMES
-    message: str  # one line on what went wrong
-    scenes: dict[str, Summary]  # by name of the scene, what was measured, with `ratios` to the base file
-    same_as: int | None  # number of an earlier trial of the same options, for which this one was not measured again
-
-    @classmethod
-    def of(cls, trial: Any) -> Attempt:
-        """A finished trial out of optuna's storage."""
-        return cls(number=trial.number, values=dict(trial.params), **trial.user_attrs["result"])
-
-    def total(self, objective: str, how: str) -> float:
-        """An objective, aggregated over scenes."""
-        return aggregate([s["ratios"][objective] for s in self.scenes.values()], how)
+    values = np.array(points)
+    return [k for k, p in enumerate(values) if not ((values <= p).all(axis=1) & (values < p).any(axis=1)).any()]
 
 
 class Sweep:
-    """A search in a folder. One process at a time works in it.
+    """A search in a folder. One process at a time works in it; it says on stderr what takes long."""
 
-    Args:
-        settings: what to do.
-        say: called with a line of text before anything that takes long, and after each trial.
-    """
-
-    def __init__(self, settings: Settings, say: Callable[[str], None] = lambda line: None) -> None:
+    def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self.say = say
         self.study: Any = None
         self.attempts: dict[int, Attempt] = {}
         self.interrupted = 0
         self._tried: dict[str, int] = {}  # what was changed: number of the trial
         self._recent: dict[Path, list[Summary]] = {}
         self._elapsed: dict[Path, float] = {}  # seconds of a process with the base file
+        self._references: dict[Path, Path | None] = {}
 
     def run(self) -> Results:
-        """Search, or go on with it, choose the best file and measure it on the scenes held out.
-
-        Returns:
-            What came out, see `results`.
+        """Search, or go on with it, choose the best file and measure it on the scenes held out; see `results`.
 
         Raises:
             UsageError: the folder holds another sweep, or a scene does not fit the base file.
             SolveError: the base file does not solve a scene.
         """
-        (self.settings.out / "trials").mkdir(parents=True, exist_ok=True)
+        make_folder(self.settings.out / "trials")
         with _alone(self.settings.out):
             self.study = self._open()
             self._recover()
-            if len(self.attempts) < self.settings.trials:
-                for scene in self.settings.scenes:
-                    self._base(scene)
+            for scene in self.settings.scenes if len(self.attempts) < self.settings.trials else ():
+                self._base(scene)
             self._queue()
             while len(self.attempts) < self.settings.trials:
-                if self.settings.sampler == "grid" and not self._waiting():
+                waiting = any(trial.state.name == "WAITING" for trial in self.study.get_trials(deepcopy=False))
+                if self.settings.sampler == "grid" and not waiting:
                     break
                 self._trial()
             self._choose()
@@ -234,9 +227,9 @@ class Sweep:
 
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        settings, storage, identity = self.settings, self._storage(), self.settings.identity()
-        directions = ["minimize"] * len(settings.objectives)
-        study = optuna.create_study(storage=storage, study_name="sweep", directions=directions, load_if_exists=True)
+        settings, identity = self.settings, self.settings.identity()
+        how = {"directions": ["minimize"] * len(settings.objective), "load_if_exists": True}
+        study = optuna.create_study(storage=self._storage(), study_name="sweep", **how)
         there = study.user_attrs.get("identity", identity)
         other = next((key for key in identity if there.get(key) != identity[key]), None)
         if other is not None:
@@ -257,40 +250,35 @@ class Sweep:
 
     def _recover(self) -> None:
         """Take finished trials over; finish one that was measured, and repeat one that was not, when the end came."""
-        from optuna.trial import TrialState
-
         for trial in self.study.get_trials(deepcopy=False):
-            if trial.state == TrialState.RUNNING and "result" in trial.user_attrs:
-                self._tell(Attempt.of(trial))
-            elif trial.state == TrialState.RUNNING:
+            if trial.state.is_finished() or trial.state.name == "WAITING":
+                continue
+            if "result" in trial.user_attrs:
+                self._tell(trial.user_attrs["result"])
+            else:
                 self.study.enqueue_trial(trial.system_attrs.get("fixed_params", {}) | trial.params)
-                self.study.tell(trial.number, state=TrialState.FAIL)
+                self.study.tell(trial.number, state=_state("FAIL"))
         for trial in self.study.get_trials(deepcopy=False):
-            if trial.state == TrialState.FAIL:
+            if trial.state.name == "FAIL":
                 self.interrupted += 1
-            elif trial.state in (TrialState.COMPLETE, TrialState.PRUNED):
-                self.attempts[trial.number] = Attempt.of(trial)
+            elif trial.state.is_finished():
+                self.attempts[trial.number] = trial.user_attrs["result"]
                 self._tried.setdefault(self._key(trial.params), trial.number)
 
     def _key(self, values: Mapping[str, Value]) -> str:
         return json.dumps(self.settings.space.changes(values), sort_keys=True)
 
-    def _waiting(self) -> bool:
-        from optuna.trial import TrialState
-
-        return bool(self.study.get_trials(deepcopy=False, states=(TrialState.WAITING,)))
-
     def _queue(self) -> None:
         """Put into line what does not come from the sampler: all of a grid, or else the base file itself."""
         settings = self.settings
         if settings.sampler == "grid":
-            size = sum(1 for _ in settings.space.grid())
-            if size > settings.trials:
+            grid = settings.space.grid()
+            if len(grid) > settings.trials:
                 raise UsageError(
-                    f"the grid of {settings.space.path} has {size:,} points, more than --trials {settings.trials}; "
-                    "declare coarser steps or fewer points, allow more trials, or take --sampler random"
+                    f"the grid of {settings.space.path} has {len(grid):,} points, more than --trials {settings.trials};"
+                    " declare coarser steps or fewer points, allow more trials, or take --sampler random"
                 )
-            for values in settings.space.grid():
+            for values in grid:
                 self.study.enqueue_trial(values, skip_if_exists=True)
         elif not self.study.trials:
             self.study.enqueue_trial(settings.space.start())
@@ -298,63 +286,36 @@ class Sweep:
     # --- measuring
 
     def _job(self, scene: Path, file: Path | None = None, time_limit: float | None = None) -> measure.Job:
-        reference = self._reference(scene)
-        return measure.Job(
-            scenes=[scene],
-            options_file=file,
-            ranks=self.settings.ranks,
-            rtols=(self.settings.tolerance,),
-            repetitions=self.settings.repetitions,
-            warm_up=self._elapsed.get(scene, 0.0) < SHORT,
-            errors=reference is not None,
-            references={} if reference is None else {str(scene): str(reference)},
-            time_limit=time_limit or self.settings.time_limit,
-            memory_limit=self.settings.memory_limit,
-        )
+        settings, exact = self.settings, self._reference(scene)
+        how: dict[str, Any] = {name: getattr(settings, name) for name in ("ranks", "repetitions", "memory_limit")}
+        how |= {"rtols": (settings.tolerance,), "time_limit": time_limit or settings.time_limit}
+        how |= {"warm_up": self._elapsed.get(scene, 0.0) < SHORT, "errors": exact is not None}
+        return measure.Job(scenes=[scene], options_file=file, references={str(scene): exact} if exact else {}, **how)
 
     def _reference(self, scene: Path) -> Path | None:
         """File with the reference solution of a scene, made once; None where it cannot be."""
-        from petsc_fs.tools import reference
-
         target = self.settings.out / "references" / f"{scene.stem}-{reference.digest(scene)[:12]}.npz"
-        failed = target.with_suffix(".failed")
-        if not target.exists() and not failed.exists():
-            self.say(f"reference solution of {scene.name}")
-            try:
-                reference.made(scene, target)
-            except SolveError as e:
-                failed.write_text(str(e), encoding="utf-8")
-        return target if target.exists() else None
+        if scene not in self._references:
+            with contextlib.suppress(SolveError):
+                if not target.exists():
+                    say(f"reference solution of {scene.name}")
+                    reference.made(scene, target)
+            self._references[scene] = target if target.exists() else None
+        return self._references[scene]
 
     def _base(self, scene: Path) -> None:
-        """Measure the base file.
-
-        Raises:
-            SolveError: it does not solve the scene.
-        """
+        """Measure the base file; a SolveError where it does not solve the scene."""
         started = time.monotonic()
         records = measure.measure(self._job(scene, self.settings.space.base))
-        outcome, message = judge(records, {"error": None})
-        if outcome != "solved" and scene in self._recent:
-            return  # it does solve the scene: the machine is to blame
+        outcome, message = judge(records)
         if outcome != "solved":
-            raise SolveError(
-                f"the base file {self.settings.space.base.name} does not solve {scene.name}, so there is nothing to "
-                f"compare with: {outcome}: {message}"
-            )
+            if scene in self._recent:
+                return  # it does solve the scene: the machine is to blame
+            name = self.settings.space.base.name
+            raise SolveError(f"the base file {name} does not solve {scene.name}, to compare with: {outcome}: {message}")
         found = summary(records, self.settings.clock)
         self._elapsed[scene] = time.monotonic() - started
         self._recent[scene] = [*self._recent.get(scene, []), found][-RECENT:]
-
-    def _base_now(self, scene: Path) -> Summary:
-        """The base file on a scene about now: the last measurement, with the median time of the recent ones."""
-        recent = self._recent[scene]
-        return recent[-1] | {"seconds": statistics.median(r["seconds"] for r in recent)}
-
-    def _limit(self, scene: Path) -> float:
-        """Seconds after which a trial is hopeless on a scene."""
-        patience, limit = self.settings.patience, self.settings.time_limit
-        return min(SLACK + patience * self._elapsed[scene], limit) if patience else limit
 
     def _trial(self) -> None:
         """Ask for values, measure, and store what came of it."""
@@ -362,38 +323,36 @@ class Sweep:
         values = self.settings.space.suggest(trial)
         earlier = self._tried.setdefault(self._key(values), trial.number)
         if earlier != trial.number:
-            same = self.attempts[earlier]
-            attempt = Attempt(trial.number, values, same.outcome, same.message, same.scenes, earlier)
+            attempt = self.attempts[earlier] | {"same_as": earlier}
         else:
             write_text(self._file(trial.number), self._text(values, trial.number))
-            attempt = Attempt(trial.number, values, *self._try(self._file(trial.number)), same_as=None)
-        stored = {k: v for k, v in vars(attempt).items() if k not in ("number", "values")}
-        trial.set_user_attr("result", stored)  # from here on, the trial needs no repetition
+            attempt = self._try(self._file(trial.number)) | {"same_as": None}
+        attempt |= {"number": trial.number, "values": values}
+        trial.set_user_attr("result", attempt)  # from here on, the trial needs no repetition
         self._tell(attempt)
         self.attempts[trial.number] = attempt
-        said = attempt.message
-        if attempt.outcome == "solved":
-            said = ", ".join(f"{o} {attempt.total(o, self.settings.aggregate):.2f}" for o in OBJECTIVES)
-        self.say(f"trial {attempt.number}: {attempt.outcome}: {said}")
+        said = ", ".join(f"{o} {total:.2f}" for o, total in attempt["totals"].items()) or attempt["message"]
+        say(f"trial {trial.number}: {attempt['outcome']}: {said}")
 
     def _tell(self, attempt: Attempt) -> None:
         """End a trial; what was not solved is pruned for optuna, whose samplers then avoid it."""
-        from optuna.trial import TrialState
-
-        if attempt.outcome == "solved":
-            settings = self.settings
-            self.study.tell(attempt.number, [attempt.total(o, settings.aggregate) for o in settings.objectives])
+        if attempt["outcome"] == "solved":
+            self.study.tell(attempt["number"], [attempt["totals"][o] for o in self.settings.objective])
         else:
-            self.study.tell(attempt.number, state=TrialState.PRUNED)
+            self.study.tell(attempt["number"], state=_state("PRUNED"))
 
-    def _try(self, file: Path) -> tuple[str, str, dict[str, Summary]]:
-        """Outcome, message and measurements of an options file on all scenes, until it turns out hopeless."""
-        settings = self.settings
+    def _try(self, file: Path) -> Attempt:
+        """Measure an options file on all scenes, until it turns out hopeless."""
+        settings, how = self.settings, self.settings.aggregate
         found: dict[str, Summary] = {}
         for scene in settings.scenes:
             if self.attempts:
                 self._base(scene)
-            base, limit = self._base_now(scene), self._limit(scene)
+            recent = self._recent[scene]
+            base = recent[-1] | {"seconds": statistics.median(r["seconds"] for r in recent)}
+            limit = settings.time_limit
+            if settings.patience:
+                limit = min(SLACK + settings.patience * self._elapsed[scene], limit)
             records = measure.measure(self._job(scene, file, limit))
             outcome, message = judge(records, base)
             if outcome == "hang" and limit < settings.time_limit:
@@ -401,42 +360,45 @@ class Sweep:
                 outcome, message = "pruned", f"{message}, that is {allowed}"
             if outcome != "solved":
                 where = f"{scene.name}: " if len(settings.scenes) > 1 else ""
-                return outcome, where + message, found
+                return {"outcome": outcome, "message": where + message, "scenes": found, "totals": {}}
             mine = summary(records, settings.clock)
             found[scene.name] = mine | {"ratios": ratios(mine, base), "base_seconds": base["seconds"]}
-        return "solved", "", found
+        totals = {o: aggregate([s["ratios"][o] for s in found.values()], how) for o in OBJECTIVES}
+        return {"outcome": "solved", "message": "", "scenes": found, "totals": totals}
 
     # --- the best file
 
     def solved(self) -> list[Attempt]:
         """Trials that were solved, each set of options once."""
-        return [a for a in self.attempts.values() if a.outcome == "solved" and a.same_as is None]
+        return [a for a in self.attempts.values() if a["outcome"] == "solved" and a["same_as"] is None]
 
     def front_objectives(self) -> tuple[str, ...]:
         """Objectives of the front: those of the search, with memory where time is the only one."""
-        named = self.settings.objectives
+        named = self.settings.objective
         return named if len(named) > 1 else (*named, "memory" if named[0] == "time" else "time")
 
-    def front(self) -> list[Attempt]:
-        """Trials of which none is better in everything, best in the first objective first."""
+    def front(self) -> list[int]:
+        """Numbers of the trials of which none is better in everything, best in the first objective first."""
         solved = self.solved()
-        points = [[a.total(o, self.settings.aggregate) for o in self.front_objectives()] for a in solved]
-        return [solved[k] for k in sorted(front(points), key=lambda k: points[k])]
+        points = [[a["totals"][o] for o in self.front_objectives()] for a in solved]
+        return [solved[k]["number"] for k in sorted(front(points), key=lambda k: points[k])]
 
     def _choose(self) -> None:
         """Measure the finalists again, choose the best, and measure it and the base file on what was held out."""
-        settings, first = self.settings, self.settings.objectives[0]
-        candidates = sorted(self.solved(), key=lambda a: a.total(first, settings.aggregate))[: settings.finalists]
-        wanted = [[a.number for a in candidates], [p.name for p in settings.hold_out], settings.confirm]
+        settings, first = self.settings, self.settings.objective[0]
+        candidates = sorted(self.solved(), key=lambda a: a["totals"][first])[: settings.finalists]
+        numbers = [a["number"] for a in candidates]
+        wanted = [numbers, [p.name for p in settings.hold_out], settings.confirm]
         if not candidates or self.study.user_attrs.get("final", {}).get("wanted") == wanted:
             return
-        confirmed = self._compare([a.number for a in candidates], settings.scenes)
-        standing = {n: f for n, f in confirmed.items() if all(s["outcome"] == "solved" for s in f.values())}
-        if not standing:
-            raise SolveError("none of the best files could be confirmed; take more --finalists")
+        confirmed = self._compare(numbers, settings.scenes)
         totals = {
-            n: aggregate([s["ratios"][first] for s in f.values()], settings.aggregate) for n, f in standing.items()
+            n: aggregate([s["ratios"][first] for s in found.values()], settings.aggregate)
+            for n, found in confirmed.items()
+            if all(s["outcome"] == "solved" for s in found.values())
         }
+        if not totals:
+            raise SolveError("none of the best files could be confirmed; take more --finalists")
         best = min(totals, key=lambda n: totals[n])
         final = {"wanted": wanted, "best": best, "finalists": {str(n): found for n, found in confirmed.items()}}
         self.study.set_user_attr("final", final | {"hold_out": self._compare([best], settings.hold_out)[best]})
@@ -447,31 +409,32 @@ class Sweep:
         variants = [measure.Variant(str(n), str(self._file(n))) for n in numbers]
         variants.insert(0, measure.Variant("", str(settings.space.base)))
         for scene in scenes:
-            self.say(f"base file against the best on {scene.name}, {settings.confirm} times")
-            how: dict[str, Any] = {"ranks": (settings.ranks,), "repeat": settings.confirm}
-            processes = list(measure.measure_all([scene], variants, self._job(scene), **how))
-            rounds = {(records[0]["variant"], records[0]["round"]): records for records in processes}
-            mine = {key: records for key, records in rounds.items() if not key[0]}
-            base = {k: summary(r, settings.clock) for (_, k), r in mine.items() if judge(r, NOTHING)[0] == "solved"}
+            say(f"base file against the best on {scene.name}, {settings.confirm} times")
+            rounds: dict[str, dict[int, list[measure.Record]]] = {v.label: {} for v in variants}
+            for records in measure.measure_all(
+                [scene], variants, self._job(scene), ranks=(settings.ranks,), repeat=settings.confirm
+            ):
+                rounds[records[0]["variant"]][records[0]["round"]] = records
+            base = {k: summary(r, settings.clock) for k, r in rounds[""].items() if judge(r)[0] == "solved"}
             if not base:
                 raise SolveError(f"the base file does not solve {scene.name} any more")
             for n in numbers:
-                good: dict[int, Summary] = {}
-                entry: Summary = {"outcome": "solved", "message": "", "base": _median(list(base.values()))}
-                for k, records in ((k, rounds[str(n), k]) for k in base if (str(n), k) in rounds):
-                    outcome, message = judge(records, base[k])
-                    if outcome == "solved":
-                        good[k] = summary(records, settings.clock)
-                    else:
-                        entry |= {"outcome": outcome, "message": message}
-                if not good and entry["outcome"] == "solved":
-                    entry |= {"outcome": "hang", "message": "no result in any round that the base file solved"}
-                if entry["outcome"] == "solved":
-                    pairs = [s["seconds"] / base[k]["seconds"] for k, s in good.items()]
-                    entry |= _median(list(good.values())) | {"spread": [min(pairs), max(pairs)]}
-                    entry["ratios"] = ratios(entry, entry["base"]) | {"time": statistics.median(pairs)}
-                found[n][scene.name] = entry
+                mine = {k: rounds[str(n)][k] for k in base if k in rounds[str(n)]}
+                found[n][scene.name] = {"base": _median(list(base.values())), **self._confirmed(mine, base)}
         return found
+
+    def _confirmed(self, mine: Mapping[int, list[measure.Record]], base: Mapping[int, Summary]) -> Summary:
+        """A file's records by round, against what the base file did in the same one."""
+        judged = [judge(records, base[k]) for k, records in mine.items()]
+        judged = judged or [("hang", "no result in any round that the base file solved")]
+        outcome, message = next((j for j in judged if j[0] != "solved"), judged[0])
+        if outcome != "solved":
+            return {"outcome": outcome, "message": message}
+        good = {k: summary(records, self.settings.clock) for k, records in mine.items()}
+        pairs = [s["seconds"] / base[k]["seconds"] for k, s in good.items()]
+        middle = _median(list(good.values()))
+        against = ratios(middle, _median(list(base.values()))) | {"time": statistics.median(pairs)}
+        return {"outcome": "solved", "message": "", **middle, "spread": [min(pairs), max(pairs)], "ratios": against}
 
     def _file(self, number: int) -> Path:
         """The options file of a trial."""
@@ -479,31 +442,28 @@ class Sweep:
 
     def _text(self, values: Mapping[str, Value], number: int) -> str:
         """The options file of a trial, with a header of its own."""
-        base = self.settings.space.base
-        lines = base.read_text(encoding="utf-8").splitlines()
-        scenes = ", ".join(path.name for path in self.settings.scenes)
+        space = self.settings.space
+        known = [line for line in space.base.read_text("utf-8").splitlines() if re.match("# (fields|not_for):", line)]
         header = [
-            f"# {base.name} tuned for {scenes}",
+            f"# {space.base.name} tuned for {', '.join(path.name for path in self.settings.scenes)}",
             "#",
-            f"# source: petsc-fs sweep, space {self.settings.space.path.name}, trial {number}",
-            *(line for line in lines if line.startswith(("# fields:", "# not_for:"))),
+            f"# source: petsc-fs sweep, space {space.path.name}, trial {number}",
         ]
-        body = self.settings.space.text(values).splitlines()
-        start = next((k for k, line in enumerate(body) if not line.startswith("#")), 0)
-        return "\n".join([*header, *body[start:]]) + "\n"
+        body = itertools.dropwhile(lambda line: line.startswith("#"), space.text(values).splitlines())
+        return "\n".join([*header, *known, *body]) + "\n"
 
     def results(self) -> Results:
         """Everything that came out, as JSON can hold it."""
         settings, final = self.settings, self.study.user_attrs.get("final")
-        outcomes = Counter(a.outcome for a in self.attempts.values())
+        outcomes = Counter(a["outcome"] for a in self.attempts.values())
         outcomes.update({"interrupted": self.interrupted} if self.interrupted else {})
-        asked = asdict(settings) | {
+        asked = asdict(settings)
+        asked["objectives"] = asked.pop("objective")
+        return asked | {
             "space": settings.space.path.name,
             "scenes": [p.name for p in settings.scenes],
             "hold_out": [p.name for p in settings.hold_out],
             "out": settings.out.name,
-        }
-        return asked | {
             "command": " ".join(["petsc-fs", *sys.argv[1:]]),
             "description": settings.space.description,
             "base": settings.space.base.name,
@@ -511,25 +471,24 @@ class Sweep:
             "front_objectives": list(self.front_objectives()),
             "machine": measure.describe_machine(),
             "outcomes": dict(outcomes),
-            "trials": [self._row(a) for a in sorted(self.attempts.values(), key=lambda a: a.number)],
-            "front": [a.number for a in self.front()],
+            "trials": [self.attempts[n] for n in sorted(self.attempts)],
+            "front": self.front(),
             "final": final,
             "changes": self._changes(final["best"]) if final else {},
         }
 
-    def _row(self, attempt: Attempt) -> dict[str, Any]:
-        solved = attempt.outcome == "solved"
-        totals = {o: attempt.total(o, self.settings.aggregate) for o in OBJECTIVES} if solved else {}
-        return vars(attempt) | {"totals": totals}
-
     def _changes(self, number: int) -> dict[str, list[str | None]]:
         """By option, its value in the base file and in that of a trial."""
         base = options.parse(self.settings.space.base)
-        changes = self.settings.space.changes(self.attempts[number].values)
+        changes = self.settings.space.changes(self.attempts[number]["values"])
         return {name: [base.get(name), value] for name, value in changes.items()}
 
 
-NOTHING: Summary = {"error": None}
+def _state(name: str) -> Any:
+    """A state of optuna's trials."""
+    from optuna.trial import TrialState
+
+    return TrialState[name]
 
 
 def _median(summaries: Sequence[Summary]) -> Summary:
@@ -557,10 +516,7 @@ def _alone(folder: Path) -> Iterator[None]:
 def write(results: Results, folder: Path, page: Path | None = None) -> list[Path]:
     """Write best.opts, sweep.json, front.png and report.md into the folder of a sweep; the files written.
 
-    Args:
-        results: of `Sweep.run`.
-        folder: of the sweep.
-        page: where the report goes as well, with its picture beside it.
+    The report goes to `page` as well, with its picture beside it.
     """
     written = [folder / "sweep.json"]
     write_text(written[0], json.dumps(results, indent=2) + "\n")
@@ -568,12 +524,12 @@ def write(results: Results, folder: Path, page: Path | None = None) -> list[Path
         trial = folder / "trials" / f"{results['final']['best']:04}.opts"
         write_text(folder / "best.opts", trial.read_text(encoding="utf-8"))
         written.append(folder / "best.opts")
-    for target in filter(None, (folder / "report.md", page)):
-        picture = target.with_suffix(".png") if target is page else target.with_name("front.png")
-        if results["front"]:
-            written.append(_draw(results, picture))
-        write_text(target, "\n".join(report(results, picture.name)) + "\n")
-        written.append(target)
+    for target, picture in ((folder / "report.md", folder / "front.png"), (page, page and page.with_suffix(".png"))):
+        if target is not None and picture is not None:
+            if results["front"]:
+                written.append(_draw(results, picture))
+            write_text(target, "\n".join(report(results, picture.name)) + "\n")
+            written.append(target)
     return written
 
 
@@ -581,42 +537,24 @@ def _draw(results: Results, target: Path) -> Path:
     from petsc_fs.tools.plots import plot_front
 
     x, y = results["front_objectives"][:2]
-    solved = {t["number"]: t["totals"] for t in results["trials"] if t["outcome"] == "solved" and t["same_as"] is None}
+    totals = {t["number"]: t["totals"] for t in results["trials"] if t["totals"] and t["same_as"] is None}
     best = [] if results["final"] is None else [results["final"]["best"]]
-    groups = {"solved": list(solved), "Pareto front": results["front"], "best.opts": best}
-    points = {name: [(solved[n][x], solved[n][y]) for n in numbers] for name, numbers in groups.items()}
+    groups = {"solved": list(totals), "Pareto front": results["front"], "best.opts": best}
+    points = {name: [(totals[n][x], totals[n][y]) for n in numbers] for name, numbers in groups.items()}
     return plot_front(points | {"base file": [(1, 1)]}, (x, y), f"{len(results['trials'])} trials", target)
 
 
 def report(results: Results, picture: str) -> Iterator[str]:
     """The report's lines, in Markdown."""
-    final, trials = results["final"], {t["number"]: t for t in results["trials"]}
+    trials = {t["number"]: t for t in results["trials"]}
     yield from (f"# Sweep: {results['description']}", "", f"Written by `{results['command']}`.", "")
     yield f"- space `{results['space']}`, base file `{results['base']}`"
     yield f"- each trial: {', '.join(results['scenes'])} on {results['ranks']} rank(s) to {results['tolerance']:g}"
     yield f"- to make small: {', '.join(results['objectives'])}, as ratios to the base file"
     yield f"- time is that of set-up and solve ({measure.CLOCKS[results['clock']]}); memory what processes grew by"
     yield from (f"- {name}: {value}" for name, value in results["machine"].items())
-    if final is not None:
-        yield from ("", f"## The best file: trial {final['best']}", "")
-        pairs = {
-            name: ["not set" if v is None else f"`{v}`" for v in both] for name, both in results["changes"].items()
-        }
-        yield from markdown(["option", results["base"], "best.opts"], [[f"`-{n}`", *both] for n, both in pairs.items()])
-        yield from (
-            "",
-            f"In turns with the base file, {results['confirm']} times; medians, and the range of ratios:",
-            "",
-        )
-        named = [(f"trial {n}, {scene}", s) for n, by in final["finalists"].items() for scene, s in by.items()]
-        named += [(f"trial {final['best']}, {scene}, held out", s) for scene, s in final["hold_out"].items()]
-        yield from markdown(COMPARED, [_compared(name, s) for name, s in named])
-        worse = [k for k, s in final["hold_out"].items() if s["outcome"] != "solved" or s["ratios"]["time"] > 1]
-        if worse:
-            yield from (
-                "",
-                f"On {', '.join(worse)} the base file is the better one: best.opts is for scenes like its own.",
-            )
+    if results["final"] is not None:
+        yield from _about_best(results)
     yield from ("", f"## How the {len(trials)} trials ended", "")
     rows = []
     for kind, count in sorted(results["outcomes"].items(), key=lambda item: -item[1]):
@@ -632,6 +570,24 @@ def report(results: Results, picture: str) -> Iterator[str]:
             words = ", ".join(f"{k} {label(v[k])}" for k in differ if k in v)
             rows.append([n, *(f"{trials[n]['totals'][o]:.2f}" for o in OBJECTIVES), words])
         yield from markdown(["trial", *OBJECTIVES, "what differs on the front"], rows)
+
+
+def _about_best(results: Results) -> Iterator[str]:
+    """What the best file changes, and how it did beside the base file."""
+    final = results["final"]
+    yield from ("", f"## The best file: trial {final['best']}", "")
+    changes = [
+        [f"`-{name}`", *("not set" if v is None else f"`{v}`" for v in both)]
+        for name, both in results["changes"].items()
+    ]
+    yield from markdown(["option", results["base"], "best.opts"], changes)
+    yield from ("", f"In turns with the base file, {results['confirm']} times; medians, and the range of ratios:", "")
+    named = [(f"trial {n}, {scene}", s) for n, by in final["finalists"].items() for scene, s in by.items()]
+    named += [(f"trial {final['best']}, {scene}, held out", s) for scene, s in final["hold_out"].items()]
+    yield from markdown(COMPARED, [_compared(name, s) for name, s in named])
+    worse = [k for k, s in final["hold_out"].items() if s["outcome"] != "solved" or s["ratios"]["time"] > 1]
+    if worse:
+        yield from ("", f"On {', '.join(worse)} the base file is the better one: best.opts is for scenes like its own.")
 
 
 COMPARED = "file, scene;base, s;s;ratio;base, iterations;iterations;base, MB;MB;base, error;error".split(";")
@@ -669,29 +625,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `petsc-fs sweep`."""
     parser.epilog = EPILOG
     add = parser.add_argument
-    # fmt: off
     add("scenes", metavar="SCENE", nargs="+", help="scenes that every trial solves")
     add("--space", required=True, metavar="FILE.yaml", help="what may change: a space, or the name of a shipped one")
-    add("--trials", type=int, default=200, metavar="N", help="trials, finished ones included (default 200)")
-    add("--sampler", choices=SAMPLERS, default="tpe", help="how values are chosen (default tpe)")
-    add("--objective", nargs="+", choices=OBJECTIVES, default=["time", "memory"],
-        help="what to make small; the first one chooses the best file (default time memory)")
-    add("--aggregate", choices=AGGREGATES, default="mean", help="of several scenes, as ratio to the base file")
     add("--hold-out", nargs="+", default=[], metavar="SCENE", help="scenes measured at the end only, reported apart")
-    add("--ranks", type=int, default=1, metavar="N", help="MPI ranks of each solve (default 1)")
-    add("--rtol", type=float, metavar="R", help="relative tolerance (default that of the base file)")
-    add("--repetitions", type=int, default=1, metavar="N", help="solves of each scene in a trial (default 1)")
-    add("--time-limit", type=float, default=300.0, metavar="S", help="seconds for one solve, start included")
-    add("--memory-limit", type=float, metavar="GB", help="address space of each rank")
-    add("--patience", type=float, default=3.0, metavar="X",
-        help="give up a trial at X times what the base file takes (default 3; 0: never)")
-    add("--finalists", type=int, default=3, metavar="N", help="files measured again at the end (default 3)")
-    add("--confirm", type=int, default=3, metavar="N", help="measurements of each of them (default 3)")
-    add("--clock", choices=measure.CLOCKS, default="wall", help="cpu: processor time, where others compute, too")
-    add("--seed", type=int, default=0, metavar="N", help="of the sampler")
+    for f in fields(Settings):
+        if f.metadata:
+            add(f"--{f.name.replace('_', '-')}", default=f.default, **f.metadata)
     add("--out", type=Path, metavar="DIR", help="folder of the sweep (default sweep-SPACE)")
     add("--page", type=Path, metavar="FILE.md", help="write the report here, too, with its picture beside it")
-    # fmt: on
 
 
 def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> int:
@@ -700,42 +641,30 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
         raise UsageError("sweep starts its own ranks; start it without mpiexec, with --ranks")
     settings = _settings(args)
     try:
-        results = Sweep(settings, lambda line: print(line, file=sys.stderr, flush=True)).run()
+        results = Sweep(settings).run()
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"the same command goes on with the sweep in {settings.out}") from None
     written = write(results, settings.out, args.page)
     final, counts = results["final"], ", ".join(f"{n} {kind}" for kind, n in results["outcomes"].items())
     if final is None:
         raise SolveError(f"no trial was solved accurately: {counts}; see {settings.out}/report.md")
-    print(
-        f"{len(results['trials'])} trials: {counts}; best is trial {final['best']}, seconds as ratios to the base file:"
-    )
-    for where, found in (("", final["finalists"][str(final["best"])]), (" (held out)", final["hold_out"])):
+    best = final["best"]
+    print(f"{len(results['trials'])} trials: {counts}; best is trial {best}, seconds as ratios to the base file:")
+    for where, found in (("", final["finalists"][str(best)]), (" (held out)", final["hold_out"])):
         for scene, s in found.items():
-            print(
-                f"  {scene}{where}: {s['ratios']['time']:.2f}"
-                if s["outcome"] == "solved"
-                else f"  {scene}: {s['outcome']}"
-            )
+            print(f"  {scene}{where}: " + (f"{s['ratios']['time']:.2f}" if s["outcome"] == "solved" else s["outcome"]))
     print(f"written: {', '.join(map(os.fspath, written))}", flush=True)
     return 0
 
 
 def _settings(args: argparse.Namespace) -> Settings:
-    """The settings that arguments stand for.
-
-    Raises:
-        UsageError: they make no sense together, or a package is missing.
-    """
+    """The settings that arguments stand for; a UsageError if they make no sense together, or a package is missing."""
     from petsc_fs.io.bundled import find_scene
 
     try:
         import optuna  # noqa: F401
     except ImportError as e:
         raise UsageError(f"sweep needs optuna and PyYAML ({e}); pip install 'petsc_fs[tune]'") from e
-    for name in ("trials", "ranks", "repetitions", "time_limit", "finalists", "confirm"):
-        if getattr(args, name) <= 0:
-            raise UsageError(f"--{name.replace('_', '-')} {getattr(args, name):g}: expected a positive number")
     if args.rtol is not None and not 0 < args.rtol < 1:
         raise UsageError(f"--rtol {args.rtol:g}: expected a number between 0 and 1")
     if args.patience and args.patience < 1:
@@ -746,17 +675,7 @@ def _settings(args: argparse.Namespace) -> Settings:
     for path in (*scenes, *hold_out):
         if not header.fits(hdf5.read_sizes(path)[1]):
             raise UsageError(f"{path.name}: {space.base.name} is for scenes with the fields {', '.join(header.fields)}")
-    names = [path.name for path in (*scenes, *hold_out)]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise UsageError(f"{twice}: named twice; scenes, held out or not, need different names")
-    same = "trials sampler aggregate ranks rtol repetitions time_limit patience finalists confirm clock seed".split()
-    return Settings(
-        scenes=scenes,
-        hold_out=hold_out,
-        space=space,
-        out=args.out or Path(f"sweep-{space.path.stem}"),
-        objectives=tuple(dict.fromkeys(args.objective)),
-        memory_limit=int(args.memory_limit * 1e9) if args.memory_limit else None,
-        **{name: getattr(args, name) for name in same},
-    )
+    measure.refuse_twice("scenes, held out or not,", [path.name for path in (*scenes, *hold_out)])
+    asked = {f.name: getattr(args, f.name) for f in fields(Settings) if f.metadata}
+    asked |= {"objective": tuple(dict.fromkeys(args.objective)), "out": args.out or Path(f"sweep-{space.path.stem}")}
+    return Settings(scenes=scenes, hold_out=hold_out, space=space, **asked)
