@@ -228,7 +228,8 @@ class Solver:
         if isinstance(first, Result) and (first.converged or file == "none"):
             result = first
         else:
-            result = self._solve_again(file, wanted, first)
+            with self._options():
+                result = self._solve_again(file, wanted, first)
         result = replace(result, setup_seconds=self._built_seconds)
         self._built_seconds = 0.0
         return result

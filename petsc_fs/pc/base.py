@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import ctypes
 import functools
+import gc
 import sys
 import traceback
 from abc import ABC, abstractmethod
@@ -34,11 +35,21 @@ def _end() -> None:
         nest.call("PCSetType", ctypes.c_void_p(handle), b"none")
 
 
+@ctypes.PYFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
+def _collect_again(_: None) -> int:
+    gc.enable()
+    return 0
+
+
 def told(method: Callable[..., None]) -> Callable[..., None]:
     """A method that PETSc calls, which prints its errors where nobody else would.
 
     Through PETSc an error comes to a program in Python as it is, but to one in C or Fortran as a blank one. PETSc has
     printed its own errors by then. What happened on all ranks is printed by all, for the first to end ends the others.
+
+    On the way through PETSc, petsc4py's error handler formats line numbers, where Python 3.12 and newer collect garbage
+    that is due, forget the error for it, and petsc4py crashes. So collection is off until Python's interpreter goes on,
+    which makes pending calls then. It would also do so after any call in here, hence the iterator.
     """
 
     @functools.wraps(method)
@@ -53,6 +64,11 @@ def told(method: Callable[..., None]) -> Callable[..., None]:
                         traceback.print_exc()
                     sys.stderr.write(f"[{pc.comm.rank}] petsc_fs: {e}\n")
                     sys.stderr.flush()
+            if gc.isenabled():
+                gc.disable()
+                (refused,) = map(ctypes.pythonapi.Py_AddPendingCall, (_collect_again,), (None,))
+                if refused:
+                    gc.enable()
             raise
 
     return told_method
