@@ -10,8 +10,7 @@ from sample import SCENES
 LIMIT = 60
 
 RAISING = """
-import gc
-import numpy as np
+import gc, sys
 import petsc4py
 petsc4py.init([])
 from petsc4py import PETSc
@@ -54,7 +53,7 @@ try:
 except Exception:
     pass
 assert not gc.isenabled()  # as the program had it
-print("over ", end="")
+sys.stdout.write("over\\n")  # at once
 """
 
 
@@ -95,7 +94,7 @@ for k in range(30):
         raise AssertionError
     solver.destroy()
     assert gc.isenabled()
-print("over ", end="")
+sys.stdout.write("over\\n")  # at once
 """
 RETRY = """
 open("raising.opts", "w").write("-pc_type python\\n-pc_python_type pcs.Raising\\n")
@@ -107,4 +106,70 @@ database["petsc_fs_retry"] = "raising.opts"
 def test_nor_does_a_foreign_pc_in_a_solver(tmp_path, retry):
     program = Program(tmp_path, FOREIGN.format(retry=retry), 1, (str(SCENES / "flow.h5"),))
     code, out, errors = program.end(LIMIT)
-    assert (code, out) == (0, "over "), errors
+    assert (code, out) == (0, "over\n"), errors
+
+ONE_RANK_FAILS = """
+import gc, sys
+gc.disable()  # what is gone at the end is gone by itself
+from mpi4py import MPI
+from petsc_fs.cli.main import main
+from petsc_fs.errors import SceneError
+from petsc_fs.io import hdf5
+
+def write_solution(*_):
+    raise SceneError("cannot be written")
+
+hdf5.write_solution = write_solution  # which rank 0 calls, after the solve
+code = main(["solve", sys.argv[1], "--save", "x.h5"])
+from petsc4py import PETSc
+from petsc_fs.solver import Solver
+kept = [o for o in gc.get_objects() if isinstance(o, Solver | PETSc.KSP | PETSc.Mat | PETSc.PC)]
+sys.stdout.write(f"kept {len(kept)}\\n")  # at once
+sys.exit(code)
+"""
+
+
+def test_an_error_on_one_rank_keeps_no_solver(tmp_path):
+    code, out, errors = Program(tmp_path, ONE_RANK_FAILS, 2, (str(SCENES / "flow.h5"),)).end(LIMIT)
+    assert code == 3
+    assert out.split() == ["kept", "0"] * 2
+    assert errors.count("petsc-fs: cannot be written") == 1
+
+
+ALIVE_ON_SOME = """
+import gc, sys
+import petsc4py
+petsc4py.init([])
+from mpi4py import MPI
+import petsc_fs
+
+class Holder:
+    pass
+
+rank, keeps = MPI.COMM_WORLD.rank, int(sys.argv[2])
+solver = petsc_fs.Solver(petsc_fs.hdf5.read(sys.argv[1]))
+result = solver.solve()
+assert result.converged
+if rank == keeps:
+    holder = Holder()
+    holder.circle, holder.kept = holder, [solver, solver.ksp, solver.ksp.getPC(), solver.system]
+    if {loose}:
+        del holder, solver, result
+else:
+    del solver, result
+    gc.collect()
+sys.stdout.write("over\\n")  # at once
+{last}
+"""
+
+
+@pytest.mark.parametrize(
+    ("keeps", "loose", "last"),
+    [(0, False, "sys.exit(3)"), (0, True, "raise RuntimeError"), (1, False, ""), (1, True, "sys.exit(3)")],
+    ids=["0_held_exit", "0_in_a_cycle_raise", "1_held_end", "1_in_a_cycle_exit"],
+)
+def test_ranks_end_that_do_not_hold_the_same(tmp_path, keeps, loose, last):
+    text = ALIVE_ON_SOME.format(loose=loose, last=last)
+    code, out, errors = Program(tmp_path, text, 2, (str(SCENES / "model1.h5"), str(keeps))).end(LIMIT)
+    assert (code != 0, out.split()) == (bool(last), ["over"] * 2), errors
+    assert "SEGV" not in errors
