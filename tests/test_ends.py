@@ -108,6 +108,7 @@ def test_nor_does_a_foreign_pc_in_a_solver(tmp_path, retry):
     code, out, errors = program.end(LIMIT)
     assert (code, out) == (0, "over\n"), errors
 
+
 ONE_RANK_FAILS = """
 import gc, sys
 gc.disable()  # what is gone at the end is gone by itself

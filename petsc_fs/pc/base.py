@@ -35,10 +35,12 @@ def _end() -> None:
         nest.call("PCSetType", ctypes.c_void_p(handle), b"none")
 
 
-@ctypes.PYFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
-def _collect_again(_: None) -> int:
+def _collect(_: None) -> int:
     gc.enable()
     return 0
+
+
+_collect_again = ctypes.PYFUNCTYPE(ctypes.c_int, ctypes.c_void_p)(_collect)
 
 
 def told(method: Callable[..., None]) -> Callable[..., None]:

@@ -181,8 +181,8 @@ def residual(matrix: CSR, b: Floats, x: Floats, y: Floats) -> Floats:
     """
     p, e = two_product(-matrix.data, x[matrix.indices])
     e -= matrix.data * y[matrix.indices]
-    ends = matrix.indptr.tolist()
-    terms, small, right = p.tolist(), e.tolist(), b.tolist()
+    lists: list[Any] = [v.tolist() for v in (matrix.indptr, p, e, b)]
+    ends, terms, small, right = lists
     try:
         found = [math.fsum([v, *terms[i:j], *small[i:j]]) for v, i, j in zip(right, ends[:-1], ends[1:], strict=True)]
     except (OverflowError, ValueError) as error:
@@ -205,7 +205,8 @@ def refine(matrix: CSR, b: Floats, correct: Solve, sizes: list[int]) -> tuple[Fl
     Raises:
         SolveError: a correction is not finite.
     """
-    high, low = np.zeros(b.size), np.zeros(b.size)
+    high: Floats = np.zeros(b.size)
+    low: Floats = np.zeros(b.size)
     bounds = np.cumsum(sizes)[:-1]
     corrections: list[float] = []
     for _ in range(STEPS):
@@ -308,7 +309,7 @@ def _iterative(scene: Scene) -> Iterator[tuple[Solve, str]]:
 
         def correct(r: Floats) -> Floats:
             size = float(np.linalg.norm(r)) or 1.0
-            found = solver.solve(rhs=by_field(scene, r / size)).solution
+            found = solver.solve(rhs=by_field(scene, np.divide(r, size))).solution
             return size * np.concatenate([found[f] for f in scene.fields])
 
         try:

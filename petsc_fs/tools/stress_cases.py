@@ -186,7 +186,9 @@ def with_rows_of(scene: Scene, other: Scene, cells: list[int]) -> Scene:
     taken[rows] = True
     for f in scene.fields:
         mine, theirs = (s.blocks.get(("contact", f)) for s in (scene, other))
-        parts = [(b, keep) for b, keep in ((mine, ~taken), (theirs, taken)) if b is not None]
+        parts: list[tuple[CSR, NDArray[np.bool_]]] = [
+            (b, keep) for b, keep in ((mine, ~taken), (theirs, taken)) if b is not None
+        ]
         if parts:
             blocks["contact", f] = _rows_together(parts, taken.size)
     rhs["contact"][taken] = other.rhs["contact"][taken]
@@ -427,8 +429,8 @@ def drawn_changes(number: int) -> tuple[list[str], Change]:
         return scene
 
     def names(random: np.random.Generator) -> list[str]:
-        shuffled: list[str] = random.permutation(list(CHANGES)).tolist()
-        return shuffled[: int(random.integers(2, 4))]
+        shuffled = map(str, random.permutation(list(CHANGES)))
+        return list(shuffled)[: int(random.integers(2, 4))]
 
     return names(np.random.default_rng([SEED, 1000 + number])), change
 
