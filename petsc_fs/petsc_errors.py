@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import re
 
 from petsc4py import PETSc
@@ -12,19 +14,22 @@ REFUSALS = (62, 63, 86)
 """PETSc's codes for a wrong argument, one out of range and an unknown type: what bad options give."""
 
 
-def translate(error: Exception, what: str) -> PetscFsError:
-    """The error of this package that stands for one of PETSc's.
+def translate(error: Exception, what: str) -> PetscFsError | KeyboardInterrupt | BrokenPipeError:
+    """The error of this package that stands for one of PETSc's; an interrupt and a closed output stand for themselves.
 
     An exception in a Python PC comes through PETSc as it is, or, in newer petsc4py, as the cause of its error.
     """
+    if os.strerror(errno.EPIPE) in str(error):  # which newer PETSc notices itself
+        return BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
     cause: BaseException | None = error
     while cause is not None:
-        if isinstance(cause, PetscFsError):
+        if isinstance(cause, PetscFsError | KeyboardInterrupt):
             return cause
         if isinstance(cause, ImportError) or (isinstance(cause, PETSc.Error) and cause.ierr in REFUSALS):
             return UsageError(f"PETSc refuses an option: {brief(cause)}")
-        if isinstance(cause, Exception) and not isinstance(cause, PETSc.Error):
-            return SolveError(f"{what}: {type(cause).__name__}: {cause}")
+        if not isinstance(cause, PETSc.Error):
+            kind = "out of memory" if isinstance(cause, MemoryError) else type(cause).__name__
+            return SolveError(f"{what}: {kind}: {' '.join(str(cause).split())}")
         cause = cause.__cause__ or cause.__context__
     return SolveError(f"{what}: {brief(error)}")
 

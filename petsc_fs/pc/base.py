@@ -59,12 +59,15 @@ def told(method: Callable[..., None]) -> Callable[..., None]:
         try:
             method(self, pc, *vectors)
         except Exception as e:
-            if not hasattr(e, "__notes__"):  # else it has come through another PC of ours
-                e.add_note(f"in {type(self).__name__} with options -{pc.getOptionsPrefix() or ''}")
-                if not sys.orig_argv and not isinstance(e, PETSc.Error):  # the interpreter was started by PETSc
-                    if not isinstance(e, PetscFsError):
+            first: BaseException = e
+            while isinstance(first, PETSc.Error) and first.__cause__ is not None:  # as newer petsc4py has it
+                first = first.__cause__
+            if not hasattr(first, "__notes__"):  # else it has come through another PC of ours
+                first.add_note(f"in {type(self).__name__} with options -{pc.getOptionsPrefix() or ''}")
+                if not sys.orig_argv and not isinstance(first, PETSc.Error):  # the interpreter was started by PETSc
+                    if not isinstance(first, PetscFsError):
                         traceback.print_exc()
-                    sys.stderr.write(f"[{pc.comm.rank}] petsc_fs: {e}\n")
+                    sys.stderr.write(f"[{pc.comm.rank}] petsc_fs: {first}\n")
                     sys.stderr.flush()
             if gc.isenabled():
                 gc.disable()
