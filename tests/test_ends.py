@@ -11,6 +11,7 @@ LIMIT = 60
 
 RAISING = """
 import gc, sys
+from mpi4py import MPI  # first, for wheels in which it is what finds libmpi
 import petsc4py
 petsc4py.init([])
 from petsc4py import PETSc
@@ -66,6 +67,7 @@ def test_a_pc_that_raises_in_set_up_crashes_no_program_by_garbage_collection(tmp
 
 FOREIGN = """
 import gc, sys, types
+from mpi4py import MPI
 import petsc4py
 petsc4py.init([])
 from petsc4py import PETSc
@@ -139,9 +141,9 @@ def test_an_error_on_one_rank_keeps_no_solver(tmp_path):
 
 ALIVE_ON_SOME = """
 import gc, sys
+from mpi4py import MPI  # first, for wheels in which it is what finds libmpi
 import petsc4py
 petsc4py.init([])
-from mpi4py import MPI
 import petsc_fs
 
 class Holder:
