@@ -576,6 +576,9 @@ class Given:
         insert_all(values | {"options_left": "no"})  # newer PETSc would repeat at its end what `judge` says
         from petsc4py import PETSc
 
+        from petsc_fs.petsc_errors import check_build
+
+        check_build()
         check(PETSc.Options().getAll())
 
     def judge(self, comm: MPI.Intracomm, left_out: Iterable[str] = ()) -> str:

@@ -313,7 +313,7 @@ def bisect(points: Floats, weights: Floats, parts: int) -> Cells:
         places, inverse = grid, np.arange(len(points))
     weight = np.bincount(inverse, weights=weights, minlength=len(places))
     part = np.zeros(len(places), dtype=np.int64)
-    todo = [(np.arange(len(places)), 0, parts)]
+    todo: list[tuple[Cells, int, int]] = [(np.arange(len(places)), 0, parts)]
     while todo:
         members, first, count = todo.pop()
         if count == 1 or not members.size:

@@ -471,7 +471,7 @@ class Scene:
 def contact_state_counts(states: Iterable[int]) -> dict[str, int]:
     """Number of fracture cells in each contact state."""
     counts = np.bincount(np.asarray(list(states), dtype=np.int64), minlength=len(CONTACT_STATES))
-    return dict(zip(CONTACT_STATES, counts.tolist(), strict=True))
+    return dict(zip(CONTACT_STATES, map(int, counts), strict=True))
 
 
 def check_order(name: str, dimension: int, size: int, rows: Callable[[int, int], CSR]) -> None:

@@ -89,7 +89,7 @@ def components(system: System, fields: Sequence[str]) -> tuple[Labels, NDArray[n
         label = np.arange(sum(counts.values()))
         a, b = np.concatenate(gathered).T
         while True:  # every cell takes the least label of its neighbours, and then that cell's
-            least = label.copy()
+            least: NDArray[np.int64] = label.copy()
             np.minimum.at(least, a, label[b])
             np.minimum.at(least, b, label[a])
             least = least[least]

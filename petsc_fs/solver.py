@@ -18,7 +18,7 @@ from petsc_fs import nest
 from petsc_fs import options as database
 from petsc_fs.errors import SceneError, SolveError, UsageError
 from petsc_fs.partition import Layout, chosen, partition
-from petsc_fs.petsc_errors import brief, translate
+from petsc_fs.petsc_errors import brief, check_build, translate
 from petsc_fs.refinement import PETSC_ATOL, Refinement, Spectrum
 from petsc_fs.result import Result
 from petsc_fs.scene import Scene
@@ -71,8 +71,9 @@ class Solver:
 
         Raises:
             SceneError: the scene does not fit together.
-            UsageError: an option has an impossible value.
+            UsageError: an option has an impossible value, or PETSc is built for complex numbers.
         """
+        check_build()
         mpi = comm or MPI.COMM_WORLD
         started = time.perf_counter()
         _destroy_dropped(mpi)
@@ -230,7 +231,8 @@ class Solver:
         if isinstance(first, Result) and (first.converged or file == "none"):
             result = first
         else:
-            result = self._solve_again(file, wanted, first)
+            with self._options():
+                result = self._solve_again(file, wanted, first)
         result = replace(result, setup_seconds=self._built_seconds)
         self._built_seconds = 0.0
         return result

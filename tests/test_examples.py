@@ -16,7 +16,7 @@ FAST = f"-options_file {ROOT}/options/contact_poromechanics_fast.opts"
 LINE = re.compile(r"(\d+) iterations, true relative residual ([\d.eE+-]+)(?:, difference to a direct solver (\S+))?")
 REFERENCE = """
 import sys, petsc4py
-petsc4py.init(sys.argv)
+petsc4py.init(["reference", *sys.argv[1:]])
 from pathlib import Path
 import petsc_fs
 from petsc_fs.io import hdf5

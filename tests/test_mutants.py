@@ -34,6 +34,17 @@ ITERATIONS = {
 }
 """On one rank."""
 
+SINCE_3_22 = {
+    "contact_poromechanics_gamg": {"model1": 47, "model2": 32, "model3": 50},
+    "poromechanics_gamg": {"biot": 22, "undrained": 27},
+}
+"""What is different with PETSc 3.22 and hypre 2.32."""
+if PETSc.Sys.getVersion() >= (3, 22):
+    ITERATIONS = {file: row | SINCE_3_22.get(file, {}) for file, row in ITERATIONS.items()}
+
+ROUNDED = {("contact_poromechanics_left", "model1"), ("fixed_stress_richardson", "model1")}
+"""Where BLAS decides on the last iteration, by how it rounds: both take one more or less with OpenBLAS."""
+
 DIRECT = {"contact_poromechanics_direct", "direct", "retry"}
 """Files with a factorisation of mechanics or of all, whose iterations are refinement, as rounding has it."""
 
@@ -69,7 +80,8 @@ def test_the_table_has_every_file_and_scene():
 @pytest.mark.parametrize(("file", "scene"), [(file, scene) for file, row in ITERATIONS.items() for scene in row])
 def test_iterations_are_exactly_those_of_the_algorithm(clean, file, scene):
     """Undrained rock notices the damping exponent; model 3 the restart of the files that take more than 30."""
-    assert solve(file, scene).iterations == ITERATIONS[file][scene]
+    found = solve(file, scene).iterations
+    assert abs(found - ITERATIONS[file][scene]) <= ((file, scene) in ROUNDED)
 
 
 @pytest.mark.parametrize("file", RESTART)

@@ -97,10 +97,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     args, message, code = argparse.Namespace(close=None), "", 0
     try:
         own, petsc = split_arguments(sys.argv[1:] if argv is None else argv)
+        said = io.StringIO()  # for argparse does not tell whether it could write
         try:
-            with contextlib.redirect_stdout(io.StringIO() if comm.rank else sys.stdout):
+            with contextlib.redirect_stdout(said):
                 args = _parser(own[:1]).parse_args(own)
         except SystemExit as e:  # --help
+            print(said.getvalue() if comm.rank == 0 else "", end="", flush=True)
             return int(e.code or 0)
         if petsc and args.command not in TAKES_PETSC:
             raise UsageError(

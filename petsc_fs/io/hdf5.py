@@ -449,7 +449,7 @@ def read_metadata(file: h5py.Group) -> Metadata:
 
 def _read_block(group: h5py.Group, what: str, shape: tuple[int, int], start: int, stop: int) -> CSR:
     """Rows start:stop of a block of a shape."""
-    encoding, found = attribute(group, "encoding-type", str), tuple(np.ravel(group.attrs["shape"]).tolist())
+    encoding, found = attribute(group, "encoding-type", str), tuple(map(int, np.ravel(group.attrs["shape"])))
     if encoding != "csr_matrix":
         raise LayoutError(f"{what}: encoding-type is {encoding!r}, expected 'csr_matrix'")
     if found != shape:

@@ -96,7 +96,8 @@ def companions(scene: Scene, name: str) -> dict[str, NDArray[np.float64]]:
 def _whole(scene: Scene) -> tuple[Integers, Integers, NDArray[np.float64]]:
     """Number of entries of each row of the whole matrix, their columns and values."""
     start = dict(zip(scene.fields, np.cumsum([0, *(scene.sizes[f] for f in scene.fields)]).tolist(), strict=False))
-    rows, columns, values = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)], [np.empty(0)]
+    rows, columns = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
+    values: list[NDArray[np.float64]] = [np.empty(0)]
     for (r, c), block in scene.blocks.items():
         rows.append(start[r] + np.repeat(np.arange(scene.sizes[r]), np.diff(block.indptr)))
         columns.append(start[c] + block.indices.astype(np.int64))
@@ -191,7 +192,7 @@ class File:
 
     def matrix(self) -> tuple[Any, int, int]:
         """Compressed rows or a dense array; number of rows and of columns."""
-        rows, columns, entries = self.integers(3).tolist()
+        rows, columns, entries = map(int, self.integers(3))
         if entries == -1:
             return self.values(rows * columns).reshape(rows, columns), rows, columns
         counts = self.integers(rows)

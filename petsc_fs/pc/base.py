@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import ctypes
 import functools
+import gc
 import sys
 import traceback
 from abc import ABC, abstractmethod
@@ -34,11 +35,23 @@ def _end() -> None:
         nest.call("PCSetType", ctypes.c_void_p(handle), b"none")
 
 
+def _collect(_: None) -> int:
+    gc.enable()
+    return 0
+
+
+_collect_again = ctypes.PYFUNCTYPE(ctypes.c_int, ctypes.c_void_p)(_collect)
+
+
 def told(method: Callable[..., None]) -> Callable[..., None]:
     """A method that PETSc calls, which prints its errors where nobody else would.
 
     Through PETSc an error comes to a program in Python as it is, but to one in C or Fortran as a blank one. PETSc has
     printed its own errors by then. What happened on all ranks is printed by all, for the first to end ends the others.
+
+    On the way through PETSc, petsc4py's error handler formats line numbers, where Python 3.12 and newer collect garbage
+    that is due, forget the error for it, and petsc4py crashes. So collection is off until Python's interpreter goes on,
+    which makes pending calls then. It would also do so after any call in here, hence the iterator.
     """
 
     @functools.wraps(method)
@@ -46,13 +59,21 @@ def told(method: Callable[..., None]) -> Callable[..., None]:
         try:
             method(self, pc, *vectors)
         except Exception as e:
-            if not hasattr(e, "__notes__"):  # else it has come through another PC of ours
-                e.add_note(f"in {type(self).__name__} with options -{pc.getOptionsPrefix() or ''}")
-                if not sys.orig_argv and not isinstance(e, PETSc.Error):  # the interpreter was started by PETSc
-                    if not isinstance(e, PetscFsError):
+            first: BaseException = e
+            while isinstance(first, PETSc.Error) and first.__cause__ is not None:  # as newer petsc4py has it
+                first = first.__cause__
+            if not hasattr(first, "__notes__"):  # else it has come through another PC of ours
+                first.add_note(f"in {type(self).__name__} with options -{pc.getOptionsPrefix() or ''}")
+                if not sys.orig_argv and not isinstance(first, PETSc.Error):  # the interpreter was started by PETSc
+                    if not isinstance(first, PetscFsError):
                         traceback.print_exc()
-                    sys.stderr.write(f"[{pc.comm.rank}] petsc_fs: {e}\n")
+                    sys.stderr.write(f"[{pc.comm.rank}] petsc_fs: {first}\n")
                     sys.stderr.flush()
+            if gc.isenabled():
+                gc.disable()
+                (refused,) = map(ctypes.pythonapi.Py_AddPendingCall, (_collect_again,), (None,))
+                if refused:
+                    gc.enable()
             raise
 
     return told_method

@@ -222,7 +222,7 @@ class Adapter:
                 raise LayoutError(
                     f"{name}: {dofs.size} unknowns on a grid of {grid.num_cells} cells, expected {bs} per cell"
                 )
-            per_cell = dofs.reshape(grid.num_cells, bs)
+            per_cell: Indices = dofs.reshape(grid.num_cells, bs)
             if name == "contact":
                 per_cell = np.roll(per_cell, 1, axis=1)
             found.setdefault(name, {})[grid] = per_cell

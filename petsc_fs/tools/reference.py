@@ -168,8 +168,8 @@ def residual(matrix: CSR, b: Floats, x: Floats, y: Floats) -> Floats:
     """The residual b - A (x + y), each entry rounded once: products are exact, and sums are those of `math.fsum`."""
     p, e = two_product(-matrix.data, x[matrix.indices])
     e -= matrix.data * y[matrix.indices]
-    ends = matrix.indptr.tolist()
-    terms, small, right = p.tolist(), e.tolist(), b.tolist()
+    lists: list[Any] = [v.tolist() for v in (matrix.indptr, p, e, b)]
+    ends, terms, small, right = lists
     try:
         found = [math.fsum([v, *terms[i:j], *small[i:j]]) for v, i, j in zip(right, ends[:-1], ends[1:], strict=True)]
     except (OverflowError, ValueError) as error:
@@ -186,7 +186,8 @@ def refine(matrix: CSR, b: Floats, correct: Solve, sizes: list[int]) -> tuple[Fl
     Raises:
         SolveError: a correction or residual is not finite.
     """
-    high, low = np.zeros(b.size), np.zeros(b.size)
+    high: Floats = np.zeros(b.size)
+    low: Floats = np.zeros(b.size)
     bounds = np.cumsum(sizes)[:-1]
     corrections: list[float] = []
     for _ in range(STEPS):
@@ -276,7 +277,7 @@ def _krylov(scene: Scene) -> Iterator[tuple[Solve, None]]:
 
         def correct(r: Floats) -> Floats:
             size = float(np.linalg.norm(r)) or 1.0
-            return size * together(scene, solver.solve(rhs=by_field(scene, r / size)).solution)
+            return size * together(scene, solver.solve(rhs=by_field(scene, np.divide(r, size))).solution)
 
         try:
             yield correct, None

@@ -290,6 +290,9 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
     if args.read:
         found = merge([read_report(path) for path in args.read])
     else:
+        from petsc_fs.petsc_errors import check_build
+
+        check_build()
         ranks = sorted({*(args.ranks or ()), *numbers}) or [1]
         known = {v.label: v for v in variants(more)}
         for name in args.files or ():
