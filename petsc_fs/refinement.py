@@ -34,7 +34,7 @@ LEAST_RTOL = 1e-12
 DETERMINED = 1e-3
 """Relative error of each field, estimated or measured, up to which a solution is taken as it is."""
 ACCEPTED = 1e-2
-"""The same where rounding allows no better one."""
+"""The same where corrections do no better."""
 BALANCED = 1e-6
 """Imbalance of a field from which a solution is in doubt, unless a third of the tolerance is more."""
 NOISE = 2.0
@@ -192,6 +192,7 @@ class Refinement:
         seen = self.ksp.getType() in (*HESSENBERG, PETSc.KSP.Type.PREONLY)  # how good the preconditioner is
         doubtful = not seen or self._missed > FAR or not self.reason.startswith("CONVERGED")
         doubtful = doubtful or max(self.system.imbalance(self.x, self.r).values()) > max(BALANCED, self.rtol / 3)
+        found: dict[str, float] | None = None
         for _ in range(MOST_IMPROVEMENTS):
             self._precondition()
             steps, eta = self._relative(self.d), max(self.check.backward.values())
@@ -212,6 +213,8 @@ class Refinement:
             self._take_step()
             if self.missing > 1.0 or self.iterations >= self.max_it:
                 break
+        if found is not None and max(found.values()) <= ACCEPTED:
+            return
         self.is_determined = False
         wrong = {f: e for f, e in self.estimates.items() if not e <= ACCEPTED}
         self.notes += (

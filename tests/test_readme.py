@@ -58,7 +58,7 @@ def test_demo_ends_with_what_a_direct_solver_takes():
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=600,
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
