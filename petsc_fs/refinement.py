@@ -34,7 +34,7 @@ LEAST_RTOL = 1e-12
 DETERMINED = 1e-3
 """Relative error of each field, estimated or measured, up to which a solution is taken as it is."""
 ACCEPTED = 1e-2
-"""The same where corrections do no better."""
+"""The same where rounding allows no better one."""
 BALANCED = 1e-6
 """Imbalance of a field from which a solution is in doubt, unless a third of the tolerance is more."""
 NOISE = 2.0
@@ -192,7 +192,6 @@ class Refinement:
         seen = self.ksp.getType() in (*HESSENBERG, PETSc.KSP.Type.PREONLY)  # how good the preconditioner is
         doubtful = not seen or self._missed > FAR or not self.reason.startswith("CONVERGED")
         doubtful = doubtful or max(self.system.imbalance(self.x, self.r).values()) > max(BALANCED, self.rtol / 3)
-        found: dict[str, float] | None = None
         for _ in range(MOST_IMPROVEMENTS):
             self._precondition()
             steps, eta = self._relative(self.d), max(self.check.backward.values())
@@ -213,14 +212,12 @@ class Refinement:
             self._take_step()
             if self.missing > 1.0 or self.iterations >= self.max_it:
                 break
-        if found is not None and max(found.values()) <= ACCEPTED:
-            return
         self.is_determined = False
-        wrong = {f: e for f, e in self.estimates.items() if not e <= ACCEPTED}
+        wrong = {f: e for f, e in self.estimates.items() if not e <= DETERMINED}
         self.notes += (
             "ill-conditioned: the residual is small, but says little of the error, which is estimated at "
             + ", ".join(f"{e:.0e} ({f})" for f, e in wrong.items())
-            + f" of the solution; at most {ACCEPTED:g} counts as converged"
+            + f" of the solution; at most {DETERMINED:g} counts as converged"
             if wrong
             else "the residual is small, but casts doubt on the solution, and its error could not be measured: the "
             "Krylov method failed on another right-hand side",
