@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import sysconfig
 from pathlib import Path
 
 import pytest
@@ -106,6 +107,8 @@ def compiler(name: str) -> None:
             pytest.skip(f"no {tool}")
     if subprocess.run(["pkg-config", "petsc"], check=False).returncode:
         pytest.skip("pkg-config knows no petsc")
+    if not Path(sysconfig.get_config_var("LIBDIR"), sysconfig.get_config_var("LDLIBRARY")).exists():
+        pytest.skip("no libpython for C programs, on Debian libpython3-dev")
 
 
 @pytest.fixture(scope="module")
