@@ -73,10 +73,14 @@ class Result:
     def report(self) -> dict[str, Any]:
         """All of it but the solution, for strict JSON: numbers that are not finite become None."""
         found = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "solution"}
-        return {name: _finite(value) for name, value in found.items()} | {"verdict": self.verdict}
+        report: dict[str, Any] = finite(found) | {"verdict": self.verdict}
+        return report
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
+    """A report as strict JSON can hold it: null for numbers that are not finite. Local."""
     if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
+        return {str(k): finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

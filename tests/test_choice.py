@@ -419,5 +419,5 @@ def test_flow_alone_imports_only_what_it_uses(tmp_path):
     *_, code, names = done.stdout.splitlines()
     assert code == "0", done.stderr
     imported = set(names.split())
-    assert not imported & {"porepy", "matplotlib", "optuna", "scipy", "yaml", "rich"}
+    assert not imported & {"porepy", "matplotlib", "optuna", "scipy", "yaml"}
     assert not {m for m in imported if m.startswith(("petsc_fs.pc", "petsc_fs.cli.lint", "petsc_fs.tools"))}

@@ -145,7 +145,7 @@ def test_one_room_knows_hdf5_and_one_porepy():
 
 def test_importing_the_package_starts_nothing():
     """Neither PETSc, which would read the command line, nor what takes long to load."""
-    heavy = ("petsc4py.PETSc", "porepy", "matplotlib", "optuna", "h5py", "scipy", "rich")
+    heavy = ("petsc4py.PETSc", "porepy", "matplotlib", "optuna", "h5py", "scipy")
     code = f"import sys, petsc_fs; print([name for name in {heavy} if name in sys.modules])"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT.parent)
     assert found.stdout.strip() == "[]"

@@ -43,7 +43,7 @@ def folders_of(*modules: str) -> list[str]:
     return list(dict.fromkeys(found))
 
 
-DEPENDENCIES = folders_of("setuptools", "rich", "pygments", "h5py", "numpy")
+DEPENDENCIES = folders_of("setuptools", "h5py", "numpy")
 PETSC = folders_of("petsc4py", "mpi4py")
 
 

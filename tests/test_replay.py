@@ -11,10 +11,11 @@ from sample import SCENES, assert_same
 from petsc_fs import options
 from petsc_fs.cli import main as cli
 from petsc_fs.cli import solve
-from petsc_fs.cli.solve import Player, finite
+from petsc_fs.cli.solve import Player
 from petsc_fs.errors import SceneError
 from petsc_fs.io import hdf5, sequence
 from petsc_fs.io.sequence import Writer
+from petsc_fs.result import finite
 from petsc_fs.solver import Solver
 
 BUNDLED = SCENES.parent / "sequences" / "model2_run.h5"

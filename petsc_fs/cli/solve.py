@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import gc
 import json
-import math
 import sys
 import time
 from collections.abc import Iterator
@@ -122,6 +121,8 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
     else:
         report |= {"steps": records, "totals": {total: sum(record[total] for record in records) for total in TOTALS}}
     solution = player.solution() if args.save is not None else None
+    from petsc_fs.result import finite
+
     with together(comm):
         if comm.rank == 0 and args.report is not None:
             write_text(args.report, json.dumps(finite(report), indent=2, allow_nan=False) + "\n")
@@ -270,15 +271,6 @@ class Player:
         if self.solver is not None:
             self.solver.destroy()
             self.solver = None
-
-
-def finite(value: Any) -> Any:
-    """A report as strict JSON can hold it: null for numbers that are not finite. Local."""
-    if isinstance(value, dict):
-        return {str(k): finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _progress(steps: list[Step], comm: MPI.Intracomm) -> Iterator[Step]:
