@@ -4,6 +4,8 @@ Narrow on purpose: each test fails where a number or a factor of the algorithm i
 `python tests/test_mutants.py` prints the table of iterations anew.
 """
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from petsc4py import PETSc
@@ -47,7 +49,10 @@ ROUNDED = {
     ("contact_poromechanics_left", "model1"): 1,
     ("fixed_stress_richardson", "model1"): 1,
 }
-"""How far counts are from these with OpenBLAS, which rounds as the processor has it."""
+"""How far counts may be from these with OpenBLAS, which rounds as the processor has it."""
+LOADED = Path("/proc/self/maps").read_text(encoding="utf-8", errors="replace").splitlines()
+if not any("openblas" in line and "numpy" not in line for line in LOADED):
+    ROUNDED = {}
 
 DIRECT = {"contact_poromechanics_direct", "direct", "retry"}
 """Files with a factorisation of mechanics or of all, whose iterations are refinement, as rounding has it."""
