@@ -6,7 +6,7 @@ import gc
 import time
 import weakref
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 
 import numpy as np
@@ -255,7 +255,10 @@ class Solver:
             run.estimate_error()
             run.explain()
             self._history = np.concatenate(run.history) if run.history else np.zeros(0)
-            solution = {f: np.ldexp(v, -system.rhs_scale) for f, v in system.by_field(run.x).items()}
+            with np.errstate(over="ignore"):
+                solution = {f: np.ldexp(v, -system.rhs_scale) for f, v in system.by_field(run.x).items()}
+            if not self.layout.comm.allreduce(all(np.isfinite(v).all() for v in solution.values()), MPI.LAND):
+                raise SolveError("the solution is too large for numbers of double precision: use other units")
         finally:
             run.destroy()
             ksp.setTolerances(rtol=self.rtol, atol=self._atol, max_it=run.max_it)
@@ -342,8 +345,9 @@ class Solver:
         found = self._finalizer.detach()
         if found is not None:
             _, _, (_, parts), _ = found
-            parts.destroy()
-            PETSc.garbage_cleanup(self.layout.comm)
+            with suppress(PETSc.Error):  # of what an error has left in the middle of an operation
+                parts.destroy()
+                PETSc.garbage_cleanup(self.layout.comm)
 
 
 class _Parts:

@@ -152,6 +152,8 @@ class System:
             self._take_rows(scene, release)
         for name in self.layout.fields:
             self.blocks[name, name].setName(name)
+        if scene is not None and scene.rows is not None:
+            self._check_unknowns()
         self._compose(scene)
         self._equilibrate()
         self.J = nest.nest_of(self.layout.fields, self.blocks, self.layout.comm)
@@ -183,6 +185,25 @@ class System:
                     "use more ranks, or a PETSc with 64-bit indices"
                 )
         scene.check_rows()
+
+    def _check_unknowns(self) -> None:
+        """Check that each unknown is in an equation; a whole scene checks that itself. Collective.
+
+        Sums over columns, with weights that let entries other than zero not cancel, are zero where it is not.
+        """
+        for name in self.layout.fields:
+            total = np.zeros(self.layout.sizes(name)[0])
+            for (row, column), block in self.blocks.items():
+                if column == name:
+                    weights = 1.0 + np.modf(np.arange(self.layout.sizes(row)[0]) * 0.6180339887498949)[0]
+                    total = total + nest.multiply_transposed(block, weights)
+            with together(self.layout.comm):
+                if (empty := np.flatnonzero(total == 0)).size:
+                    cell = self.layout.own_cells(name)[empty[0] // self.layout.block_size(name)]
+                    raise SceneError(
+                        f"{name}: the unknown of cell {cell} has no entry or only zeros in the matrix, which is "
+                        "singular so; leave the cell out, or give it a row with 1 on the diagonal"
+                    )
 
     def _bsize(self, r: str, c: str) -> tuple[int, int]:
         return self.layout.block_size(r), self.layout.block_size(c)

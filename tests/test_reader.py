@@ -147,3 +147,17 @@ def test_the_row_with_a_nan_is_named_by_its_number_in_the_file(shared_tmp_path):
     path = damaged(shared_tmp_path, "model2", change)
     with same_error(r"block \(mass, momentum\): row 777 has an entry that is not finite"):
         read_distributed(path, comm, "rcb")
+
+
+def test_an_unknown_that_is_in_no_equation_is_named(shared_tmp_path):
+    """Its equation has entries, so that no rank alone can tell."""
+
+    def forget(file: h5py.File) -> None:
+        for row in ("intf_flow", "mass"):
+            block = file[f"blocks/{row}/mass"]
+            block["data"][...] = np.where(block["indices"][()] == 5, 0.0, block["data"][()])
+
+    path = damaged(shared_tmp_path, "flow", forget)
+    with same_error(r"mass: the unknown of cell 5 has no entry or only zeros in the matrix"):
+        scene, layout = read_distributed(path, comm)
+        Solver(scene, layout=layout)

@@ -183,6 +183,14 @@ def test_what_the_equations_do_not_determine_is_no_solution(database, file, ksp_
     assert error <= 1e-2 or not result.converged, result
 
 
+def test_a_solution_too_large_for_numbers_is_an_error():
+    scene = small(20)
+    blocks = {rc: CSR(B.indptr, B.indices, 1e-250 * B.data) for rc, B in scene.blocks.items()}
+    solver = Solver(replace(scene, blocks=blocks, rhs={f: 1e200 * v for f, v in scene.rhs.items()}))
+    with pytest.raises(SolveError, match="too large for numbers of double precision"):
+        solver.solve()
+
+
 def test_a_factorisation_alone_is_enough(database):
     database("direct.opts", ksp_type="preonly", ksp_norm_type="none")
     result = verified(load("model2"), Solver(load("model2")))
