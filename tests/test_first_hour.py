@@ -136,7 +136,7 @@ def asked_for() -> dict[str, object]:
             words = [a for a in node.args if not (isinstance(a, ast.Name) and a.id == "pc")]
             if name not in ASK or not words or not isinstance(words[0], ast.Constant):
                 continue
-            if words[0].value.startswith(("ksp_", "pc_")):  # PETSc's own
+            if str(words[0].value).startswith(("ksp_", "pc_")):  # PETSc's own
                 continue
             try:
                 code = compile(ast.Expression(words[1]), str(path), "eval")
