@@ -228,6 +228,7 @@ class Refinement:
         try:
             self.ksp.getPC().apply(self.r, self.d)
         except (PETSc.Error, ImportError) as e:
+            self.ksp.incRef()  # with a scatter under way, nothing in it can be destroyed
             raise translate(e, "the preconditioner failed") from None
         self._leave_null_space()
 
@@ -275,6 +276,7 @@ class Refinement:
         try:
             ksp.solve(self.r, self.d)
         except (PETSc.Error, ImportError) as e:
+            ksp.incRef()  # as in `_precondition`
             raise translate(e, "solve failed") from None
         self._leave_null_space()
         self.passes.append(ksp.getIterationNumber())
@@ -324,6 +326,7 @@ def broken_level(pc: PETSc.PC) -> str:
             part.apply(x, y)
             what = "" if math.isfinite(y.norm()) else "turns ones into numbers that are not finite"
         except PETSc.Error as e:
+            pc.incRef()  # as in `_precondition`
             what = f"fails (error {e.ierr})"
         for v in (x, y):
             v.destroy()

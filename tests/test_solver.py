@@ -454,6 +454,29 @@ class Spoiled:
             y.set(np.nan)
 
 
+class Raising:
+    """Copies, until the fourth application fails, in the middle of what the levels around it are about."""
+
+    applications = 0
+
+    def apply(self, pc, x, y):
+        Raising.applications += 1
+        x.copy(y)
+        if Raising.applications > 3:
+            raise PETSc.Error(73)
+
+
+def test_after_an_error_in_the_middle_of_a_solve_others_can_be_destroyed_and_solved(database):
+    leaf = LEAF | {f"{MECHANICS}pc_python_type": f"{__name__}.Raising"}
+    database("contact_poromechanics.opts", **leaf)
+    for _ in range(4):
+        Raising.applications = 0
+        solver = Solver(load("model2"))
+        with pytest.raises(SolveError, match="solve failed"):
+            solver.solve()
+        solver.destroy()
+
+
 def test_numbers_that_are_not_finite_stop_a_solve_at_once_and_the_level_is_named(database):
     Spoiled.applications = 0
     leaf = LEAF | {f"{MECHANICS}pc_python_type": f"{__name__}.Spoiled"}
