@@ -301,25 +301,14 @@ def diagonal_blocks(A: PETSc.Mat, size: int) -> NDArray[np.float64]:
     return dense
 
 
-def multiply(A: PETSc.Mat, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The product of a matrix with the rows of a vector on this rank. Collective."""
-    right, left = A.createVecs()
-    right.setArray(x)
-    A.mult(right, left)
-    product = np.array(left.getArray())
-    right.destroy()
-    left.destroy()
-    return product
-
-
-def multiply_transposed(A: PETSc.Mat, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same with the transpose. Collective."""
-    right, left = A.createVecs()
-    left.setArray(x)
-    A.multTranspose(left, right)
-    product = np.array(right.getArray())
-    right.destroy()
-    left.destroy()
+def multiply(A: PETSc.Mat, x: NDArray[np.float64], *, transposed: bool = False) -> NDArray[np.float64]:
+    """The product of a matrix, or its transpose, with the rows of a vector on this rank. Collective."""
+    given, found = A.createVecs()[:: -1 if transposed else 1]
+    given.setArray(x)
+    (A.multTranspose if transposed else A.mult)(given, found)
+    product = np.array(found.getArray())
+    given.destroy()
+    found.destroy()
     return product
 
 

@@ -196,7 +196,7 @@ class System:
             for (row, column), block in self.blocks.items():
                 if column == name:
                     weights = 1.0 + np.modf(np.arange(self.layout.sizes(row)[0]) * 0.6180339887498949)[0]
-                    total = total + nest.multiply_transposed(block, weights)
+                    total = total + nest.multiply(block, weights, transposed=True)
             with together(self.layout.comm):
                 if (empty := np.flatnonzero(total == 0)).size:
                     cell = self.layout.own_cells(name)[empty[0] // self.layout.block_size(name)]
@@ -403,7 +403,7 @@ class System:
             sums[k] = weights @ left[f], 0.0, weights @ rhs[f]
             for (row, column), block in self.blocks.items():
                 if row == f:
-                    sums[k, 1] += np.abs(nest.multiply_transposed(block, weights)) @ np.abs(values[column])
+                    sums[k, 1] += np.abs(nest.multiply(block, weights, transposed=True)) @ np.abs(values[column])
         missing, terms, rights = np.abs(self.layout.comm.allreduce(sums)).T
         found = missing / np.where(terms + rights > 0, terms + rights, 1.0)
         return dict(zip(self.layout.fields, found.tolist(), strict=True))
