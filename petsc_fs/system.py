@@ -189,13 +189,14 @@ class System:
     def _check_unknowns(self) -> None:
         """Check that each unknown is in an equation; a whole scene checks that itself. Collective.
 
-        Sums over columns, with weights that let entries other than zero not cancel, are zero where it is not.
+        Sums over columns, with another weight for each row so that what is not zero does not cancel, are zero where it
+        is not.
         """
         for name in self.layout.fields:
             total = np.zeros(self.layout.sizes(name)[0])
-            for (row, column), block in self.blocks.items():
+            for (_, column), block in self.blocks.items():
                 if column == name:
-                    weights = 1.0 + np.modf(np.arange(self.layout.sizes(row)[0]) * 0.6180339887498949)[0]
+                    weights = 1.0 + np.modf(np.arange(*block.getOwnershipRange()) * 0.6180339887498949)[0]
                     total = total + nest.multiply(block, weights, transposed=True)
             with together(self.layout.comm):
                 if (empty := np.flatnonzero(total == 0)).size:
