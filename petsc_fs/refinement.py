@@ -35,8 +35,8 @@ DETERMINED = 1e-3
 """Relative error of each field, estimated or measured, up to which a solution is taken as it is."""
 ACCEPTED = 1e-2
 """The same where rounding allows no better one."""
-BALANCED = 1e-6
-"""Imbalance of a field from which a solution is in doubt, unless a third of the tolerance is more."""
+IMBALANCE = 1e-6
+"""That of a field from which a solution is in doubt, unless a third of the tolerance is more."""
 NOISE = 2.0
 """Size of a perturbation beside the residual."""
 FAR = 10.0
@@ -191,7 +191,7 @@ class Refinement:
             return
         seen = self.ksp.getType() in (*HESSENBERG, PETSc.KSP.Type.PREONLY)  # how good the preconditioner is
         doubtful = not seen or self._missed > FAR or not self.reason.startswith("CONVERGED")
-        doubtful = doubtful or max(self.system.imbalance(self.x, self.r).values()) > max(BALANCED, self.rtol / 3)
+        doubtful = doubtful or max(self.system.imbalance(self.x, self.r).values()) > max(IMBALANCE, self.rtol / 3)
         for _ in range(MOST_IMPROVEMENTS):
             self._precondition()
             steps, eta = self._relative(self.d), max(self.check.backward.values())

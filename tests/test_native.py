@@ -141,7 +141,8 @@ def test_over_newton_steps_every_level_is_set_up_once_and_kept(reuse, monkeypatc
             with solver(A) as fresh:
                 expected, exact = solve(fresh, model.rhs)
             assert abs(found - expected) <= (10 if reuse else 0)
-            np.testing.assert_allclose(x, exact, rtol=0, atol=(1e-5 if reuse else 1e-12) * np.abs(exact).max())
+            near = 1e-6 if PETSc.Sys.getVersion() < (3, 22) else 1e-5  # newer hypre, on four ranks
+            np.testing.assert_allclose(x, exact, rtol=0, atol=(near if reuse else 1e-12) * np.abs(exact).max())
 
 
 LEVEL_3 = "qr_fieldsplit_1_fieldsplit_1_fs_"
