@@ -10,7 +10,7 @@ from programs import ENVIRONMENT, ROOT
 
 FENCE = re.compile(r"^```([^\n`]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 RUNNERS = {"bash": ["bash", "-euo", "pipefail", "-c"], "python": [sys.executable, "-c"]}
-LIMIT = 120
+LIMIT = 900
 
 
 def blocks(text: str) -> list[tuple[str, str]]:
