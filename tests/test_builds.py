@@ -92,6 +92,22 @@ def test_the_mpiexec_of_another_mpi_is_refused():
     assert done.stderr.count("petsc-fs: mpiexec has started 2 ranks (PMI_SIZE), each of which is alone") == 2
 
 
+def test_the_scripts_mpiexec_does_not_start_itself(tmp_path):
+    (tmp_path / "mpiexec").write_text(MPIEXEC.read_text())
+    (tmp_path / "mpiexec").chmod(0o755)
+    tools = tmp_path / "tools"
+    tools.mkdir()
+    for tool in ("bash", "env", "sed", "dirname", "realpath"):
+        (tools / tool).symlink_to(shutil.which(tool))
+    for more, code in ((os.environ["PATH"], 0), (tools, 2)):
+        environment = {name: value for name, value in ENVIRONMENT.items() if name != "MPIEXEC"}
+        environment["PATH"] = f"{tmp_path}{os.pathsep}{more}"
+        done = subprocess.run(
+            ["mpiexec", "--version"], env=environment, capture_output=True, text=True, timeout=LIMIT, check=False
+        )
+        assert (done.returncode, "found no mpiexec" in done.stderr) == (code, code == 2)
+
+
 def test_a_file_with_hypre_says_what_else_there_is(monkeypatch):
     error = PETSc.Error(86)
     monkeypatch.setattr(PETSc.Error, "__str__", lambda _: "error code 86\n[0] Unable to find requested PC type hypre")
