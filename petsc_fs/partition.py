@@ -224,7 +224,7 @@ def partition(
       and cut between places only, so that all fields of one place are together: products with blocks of contact then
       need no communication, and S^1 and S^3 next to none;
     - ptscotch: the graph of couplings between all cells, by PETSc's MatPartitioning on rank 0
-      (`-petsc_fs_mat_partitioning_type` takes another one); needs the whole scene there;
+      (`-petsc_fs_mat_partitioning_type` takes another one);
     - contiguous: each field in the order of the scene, in chunks of equal length;
     - auto: rcb where all cell centres are known, else contiguous.
 
@@ -251,6 +251,7 @@ def partition(
             raise UsageError(f"-{prefix}petsc_fs_ordering morton: contiguous chunks keep the scene's order; use rcb")
         return Layout.contiguous(comm, dimension, sizes)
     centers = _centers(scene, comm, cells)
+    edges = comm.gather(couplings(scene, cells)) if kind == "ptscotch" and comm.size > 1 else None
     owners: dict[str, Cells] | None = None
     keys: dict[str, Cells] = {}
     with together(comm):
@@ -263,15 +264,16 @@ def partition(
                     "natural, or give them"
                 )
             ends = np.cumsum([*cells.values()])[:-1]
-            if kind == "ptscotch" and comm.size > 1:
-                part = graph_parts(scene, cells, comm.size, prefix)
+            part: Cells | None = None
+            if edges is not None:
+                part = graph_parts(np.concatenate(edges), sum(cells.values()), comm.size, prefix)
             elif centers:
                 weights = [np.full(n, float(FIELD[f].block_size(dimension))) for f, n in cells.items()]
                 part = bisect(np.concatenate([*centers.values()]), np.concatenate(weights), comm.size)
             if centers and wants_order:
                 order = np.split(morton(np.concatenate([*centers.values()])), ends)
                 keys = dict(zip(cells, order, strict=True))
-            if centers or kind == "ptscotch":
+            if part is not None:
                 owners = dict(zip(cells, np.split(part, ends), strict=True))
     owners, keys = comm.bcast((owners, keys))
     if owners is None:
@@ -349,24 +351,30 @@ def morton(points: Floats) -> Cells:
     return key
 
 
-def graph_parts(scene: Scene, cells: Mapping[str, int], parts: int, prefix: str = "") -> Cells:
-    """Parts of all cells of all fields, by the graph of their couplings. Local, on a whole scene.
+def couplings(scene: Scene | None, cells: Mapping[str, int]) -> Cells:
+    """Pairs of cells that the rows held here couple, both ways; cell i of all and j as the number i n + j. Local."""
+    pairs = [np.zeros(0, dtype=np.int64)]
+    if scene is None:
+        return pairs[0]
+    first = dict(zip(cells, np.cumsum([0, *cells.values()])[:-1], strict=True))
+    n = sum(cells.values())
+    for (r, c), block in scene.blocks.items():
+        start, stop = scene.row_range(r)
+        rows = first[r] + np.repeat(np.arange(start, stop), np.diff(block.indptr)) // scene.block_size(r)
+        columns = first[c] + block.indices.astype(np.int64) // scene.block_size(c)
+        pairs.append(np.unique(np.concatenate([rows * n + columns, columns * n + rows])))
+    return np.unique(np.concatenate(pairs))
+
+
+def graph_parts(pairs: Cells, n: int, parts: int, prefix: str = "") -> Cells:
+    """Parts of n cells by the graph of their couplings, see `couplings`. Local.
 
     Raises:
-        UsageError: this PETSc has no such partitioner, or the scene is not whole.
+        UsageError: this PETSc has no such partitioner.
     """
     from petsc4py import PETSc
 
-    if scene.rows is not None:
-        raise UsageError(f"-{prefix}petsc_fs_partition ptscotch: needs the whole scene on one rank; use rcb")
-    first = dict(zip(cells, np.cumsum([0, *cells.values()])[:-1], strict=True))
-    n = sum(cells.values())
-    pairs = [np.zeros(0, dtype=np.int64)]
-    for (r, c), block in scene.blocks.items():
-        rows = first[r] + np.repeat(np.arange(block.indptr.size - 1), np.diff(block.indptr)) // scene.block_size(r)
-        columns = first[c] + block.indices.astype(np.int64) // scene.block_size(c)
-        pairs.append(np.unique(np.concatenate([rows * n + columns, columns * n + rows])))
-    edges = np.unique(np.concatenate(pairs))
+    edges = np.unique(pairs)
     rows, columns = np.divmod(edges[edges // n != edges % n], n)
     indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))])
     csr = (indptr.astype(PETSc.IntType), columns.astype(PETSc.IntType), np.ones(columns.size))

@@ -16,7 +16,7 @@ from petsc_fs.errors import LayoutError, SceneError, UsageError
 from petsc_fs.fields import FIELD
 from petsc_fs.io import hdf5
 from petsc_fs.io.reader import read_distributed
-from petsc_fs.partition import KINDS, ORDERINGS, bisect, chosen, morton, partition
+from petsc_fs.partition import KINDS, ORDERINGS, bisect, chosen, couplings, morton, partition
 from petsc_fs.scene import Scene
 from petsc_fs.solver import Solver
 
@@ -279,6 +279,17 @@ def test_only_rank_0_needs_the_scene_or_each_rank_its_share():
         for f in scene.fields:
             np.testing.assert_array_equal(layout.places(f), other.places(f))
             np.testing.assert_array_equal(layout.offsets[f], other.offsets[f])
+    cells = {f: n // scene.block_size(f) for f, n in scene.sizes.items()}
+    shares = np.concatenate(comm.allgather(couplings(share, cells)))
+    np.testing.assert_array_equal(np.unique(shares), couplings(scene, cells))
+
+
+@pytest.mark.mpi
+@pytest.mark.skipif("ptscotch" not in HERE, reason="not in this PETSc")
+def test_a_file_is_cut_by_its_graph(database):
+    database("contact_poromechanics_fast.opts", petsc_fs_partition="ptscotch")
+    scene, _ = read_distributed(SCENES / "model3.h5", comm)
+    assert verified(load("model3"), Solver(scene)).converged
 
 
 @pytest.mark.mpi
