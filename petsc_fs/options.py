@@ -40,10 +40,12 @@ OWN = (
     *(ALLOW_UNUSED, "qr_side", "ksp_monitor", "ksp_monitor_true_residual", "ksp_view", "ksp_converged_reason"),
 )
 """Options that somebody may mean at the outermost level although no shipped file has them."""
+FIXED_STRESS = ("fs_type", "fs_damping", "fs_drop")
+"""Options of a FixedStress."""
 AT_ANY_LEVEL = (
     *(f"ksp_{name}" for name in ("type", "rtol", "atol", "max_it", "gmres_restart")),
     *(f"pc_{name}" for name in ("type", "fieldsplit_type", "hypre_type", "hypre_boomeramg_strong_threshold")),
-    *("fs_type", "fs_damping"),
+    *FIXED_STRESS,
 )
 """The same at any level."""
 NUMBERS: dict[str, tuple[float, float, bool]] = {
@@ -52,6 +54,8 @@ NUMBERS: dict[str, tuple[float, float, bool]] = {
     "ksp_divtol": (0.0, math.inf, False),
     "ksp_max_it": (0, math.inf, True),
     "ksp_gmres_restart": (1, math.inf, True),
+    "component_drop": (0.0, 1.0, False),
+    "fs_drop": (0.0, 1.0, False),
 }
 """Least value, value that is too large, and whether it is a whole number, of options that end in these names."""
 NO_OPTION = "is not an option; options start with '-'"
@@ -246,7 +250,7 @@ CANONICAL = "contact_poromechanics_fast.opts"
 WITHOUT_HYPRE = "contact_poromechanics_gamg.opts"
 """The same for a PETSc that lacks hypre."""
 REST = "qr_fieldsplit_1_"
-STRESS = tuple(f"{REST}fieldsplit_1_{name}" for name in ("fs_type", "fs_damping", "pc_python_type"))
+STRESS = tuple(f"{REST}fieldsplit_1_{name}" for name in (*FIXED_STRESS, "pc_python_type"))
 LEFT_OUT: dict[str, tuple[str, ...]] = {
     "no contact: Q_r and the first Schur level left out": ("qr_side", "qr_mechanics_", "qr_fieldsplit_contact_"),
     "no mechanics: the second Schur level with fixed stress left out": (f"{REST}fieldsplit_mechanics_", *STRESS),
@@ -348,9 +352,9 @@ def cut(canonical: Mapping[str, str | None], facts: Facts) -> Options:
 
     inner = _under(stress, "fs_")
     node = inner if len(flow) == len(FLOW) else _under(inner, f"fieldsplit_{flow[0]}_") if flow else {}
-    node = {name: value for name, value in node.items() if name not in ("type", "damping", "ksp_type")}
+    node = {name: value for name, value in node.items() if f"fs_{name}" not in FIXED_STRESS and name != "ksp_type"}
     if mechanics and "mass" in flow and facts.flow_moves_rock and facts.rock_moves_flow:
-        own = {k: v for k, v in stress.items() if not k.startswith("fs_") or k in ("fs_type", "fs_damping")}
+        own = {k: v for k, v in stress.items() if not k.startswith("fs_") or k in FIXED_STRESS}
         node = own | _put("fs_", node)
     members = list(flow)
     if mechanics:

@@ -11,6 +11,7 @@ from petsc4py import PETSc
 
 from petsc_fs.errors import LayoutError, SceneError
 from petsc_fs.pc.base import BasePC, choice, told
+from petsc_fs.pc.sparser import sparser
 
 ORDERS = ("forward", "backward", "none")
 """Values of -component_order; the first is the default."""
@@ -35,6 +36,8 @@ class ComponentSweep(BasePC):
     Options, with the prefix of this PC:
         -component_order <forward> (forward, backward, none): from the first component to the last, the other
             way, or without couplings between them (block Jacobi).
+        -component_drop <0>: entries of a component's matrix less than this share of the diagonal of their row are left
+            out, see `petsc_fs.pc.sparser`; 0 keeps all.
         -component_*: of the inner PCs, the same for all components.
     """
 
@@ -63,8 +66,9 @@ class ComponentSweep(BasePC):
                 inner.setOptionsPrefix(prefix)
                 inner.incrementTabLevel(1, parent=pc)
                 inner.setFromOptions()
+        drop = PETSc.Options(pc.getOptionsPrefix() or "").getReal("component_drop", 0)
         for k, inner in enumerate(self.inners):
-            matrix = _component(blocks, D, k, k)
+            matrix = sparser(_component(blocks, D, k, k), drop)
             if inner.getType() == "hypre":
                 _check_diagonal(matrix, prefix)
                 aij, matrix = matrix, matrix.convert("hypre", PETSc.Mat())  # else PCHYPRE has a copy beside it

@@ -12,6 +12,7 @@ from petsc_fs import nest
 from petsc_fs.errors import UsageError
 from petsc_fs.pc.algebraic import stabilisation
 from petsc_fs.pc.base import WrapperPC, choice, text
+from petsc_fs.pc.sparser import sparser
 
 PUBLISHED_DAMPING = 0.6
 FAR = 30.0
@@ -32,6 +33,8 @@ class FixedStress(WrapperPC):
             alone, see `petsc_fs.pc.algebraic`; the operator must be the Schur complement that PCFIELDSPLIT makes,
             which knows the blocks of mechanics.
         -fs_damping <0.6>: the exponent; 1 is the paper's formula, 0.6 what its published code uses.
+        -fs_drop <0>: entries of the block of pressure less than this share of the diagonal of their row are left out,
+            see `petsc_fs.pc.sparser`; 0 keeps all.
         -fs_*: of the inner PC.
     """
 
@@ -78,6 +81,7 @@ class FixedStress(WrapperPC):
         S = block.duplicate(copy=True)
         S.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)  # the diagonal may be missing from the pattern
         S.setDiagonal(diagonal, addv=PETSc.InsertMode.ADD_VALUES)
+        S = sparser(S, PETSc.Options(prefix).getReal("fs_drop", 0))
         S.setName(block.getName())
         diagonal.destroy()
         if not whole:
