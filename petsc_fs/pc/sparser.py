@@ -38,6 +38,7 @@ def sparser(A: PETSc.Mat, share: float) -> PETSc.Mat:
     B.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)  # the diagonal may be missing from the pattern
     lost, sums = A.getRowSum(), B.getRowSum()
     lost.axpy(-1.0, sums)
+    lost.setArray(np.where(np.diff(csr[0]) < counts, lost.getArray(), 0.0))  # without rounding where nothing is
     B.setDiagonal(lost, addv=PETSc.InsertMode.ADD_VALUES)
     for thing in (lost, sums, A):
         thing.destroy()
