@@ -14,6 +14,7 @@ from petsc_fs import nest  # noqa: E402
 options = PETSc.Options()
 folder, dimension = Path(options.getString("dir", "model1_petsc")), options.getInt("dim", 2)
 files = ("contact", "intf_force", "momentum", "intf_flow", "mass")
+files = tuple(file for file in files if (folder / "fields" / f"{file}.petsc").exists())
 names = options.getString("names", ",".join(files)).split(",")  # of the fields, as this program calls them
 
 
@@ -38,7 +39,7 @@ for name, file in zip(names, files, strict=True):
 
 # A block per pair of fields; those on the diagonal carry the names, and that of pressure what FixedStress needs.
 J = nest.split(A, fields)
-mass = J.getNestSubMatrix(4, 4)
+mass = J.getNestSubMatrix(len(files) - 1, len(files) - 1)
 for what in ("fixed_stress_base", "fixed_stress_ratio"):
     mass.compose(what, load(mass.createVecLeft(), f"fields/mass.{what}.petsc"))
 
@@ -49,6 +50,7 @@ PETSc.Scatter().create(b, PETSc.IS().createGeneral(there), rhs, None).scatter(b,
 
 ksp = PETSc.KSP().create()
 ksp.setOperators(J)
+nest.give_fields(ksp)  # for files that begin with a PCFIELDSPLIT
 ksp.setFromOptions()
 ksp.solve(rhs, x)
 PETSc.Sys.Print(f"{ksp.its} iterations, true relative residual {(rhs - J * x).norm() / rhs.norm():.1e}")
