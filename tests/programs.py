@@ -32,32 +32,34 @@ class Program:
         command = [sys.executable, "-u", str(self.script), *arguments]
         if ranks > 1:
             command = [str(MPIEXEC), "-n", str(ranks), *command]
-        self.output = self.script.with_suffix(".out")
+        self.files = self.script.with_suffix(".out"), self.script.with_suffix(".err")
         self.started = time.monotonic()
-        with self.output.open("w") as output:
-            self.process = subprocess.Popen(
-                command, cwd=folder, env=ENVIRONMENT, stdout=output, stderr=subprocess.PIPE, text=True
-            )
+        with self.files[0].open("w") as output, self.files[1].open("w") as errors:
+            self.process = subprocess.Popen(command, cwd=folder, env=ENVIRONMENT, stdout=output, stderr=errors)
+
+    def texts(self) -> tuple[str, str]:
+        """Standard output and error, so far."""
+        return self.files[0].read_text(), self.files[1].read_text()
 
     def end(self, limit: float) -> tuple[int, str, str]:
         """Exit code, standard output and error; fails if it takes longer, or leaves a rank behind."""
         try:
-            _, errors = self.process.communicate(timeout=limit)
+            self.process.wait(timeout=limit)
         except subprocess.TimeoutExpired:
             left = self.ranks()
             for rank in left:
                 os.kill(rank, signal.SIGKILL)
             self.process.kill()
-            _, errors = self.process.communicate()
-            raise AssertionError(f"{len(left)} ranks after {limit} s\n{self.output.read_text()}\n{errors}") from None
+            self.process.wait()
+            raise AssertionError("\n".join([f"{len(left)} ranks after {limit} s", *self.texts()])) from None
         assert not self.ranks()
-        return self.process.returncode, self.output.read_text(), errors
+        return self.process.returncode, *self.texts()
 
     def wait_for(self, word: str, limit: float = 60.0) -> list[str]:
-        """Lines of standard output, once one of them has the word in it."""
-        while word not in (text := self.output.read_text()):
+        """Lines of output once one of them has the word in it: Open MPI 5 may send it to the wrong one of the two."""
+        while word not in (text := "".join(self.texts())):
             if self.process.poll() is not None or time.monotonic() > self.started + limit:
-                raise AssertionError(f"no {word!r} in {text!r}\n{self.end(1.0)[2]}")
+                raise AssertionError(f"no {word!r} in {text!r}\n{self.end(1.0)}")
             time.sleep(0.05)
         return text.splitlines()
 
