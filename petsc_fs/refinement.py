@@ -133,21 +133,12 @@ class Refinement:
         strictness = 1.0
         while self.missing > 1.0 and len(self.passes) < MOST_PASSES and self.iterations < self.max_it:
             old = self.missing
-            self._pass(max(strictness * self._correction_rtol(), LEAST_RTOL))
+            self._pass(max(strictness * min(MARGIN / self.missing, 0.5), LEAST_RTOL))
             self._take_step()
             if self.missing > 0.5 * old:
                 if strictness < 1.0:
                     return
                 strictness = STRICTER
-
-    def _correction_rtol(self) -> float:
-        """Tolerance of a correction: a field that misses its own may be a small part of the residual. Collective."""
-        (norms,) = self.system.norms(self.system.by_field(self.r))
-        wanted = [MARGIN / self.missing]
-        for f, e in self.check.backward.items():
-            if e > self.field_goal:
-                wanted.append(MARGIN * self.field_goal / e * norms[f] / (norm(norms) or 1.0))
-        return min(max(min(wanted), LEAST_RTOL), 0.5)
 
     def explain(self) -> None:
         """A note on why a solution does not count, where there is none yet. Collective."""

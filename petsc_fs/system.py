@@ -193,7 +193,7 @@ class System:
         is not.
         """
         for name in self.layout.fields:
-            total = np.zeros(self.layout.sizes(name)[0])
+            total: Floats = np.zeros(self.layout.sizes(name)[0])
             for (_, column), block in self.blocks.items():
                 if column == name:
                     weights = 1.0 + np.modf(np.arange(*block.getOwnershipRange()) * 0.6180339887498949)[0]

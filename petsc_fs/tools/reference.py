@@ -290,7 +290,7 @@ def _krylov(scene: Scene) -> Iterator[tuple[Solve, None]]:
 
 def weights(scene: Scene) -> dict[str, Floats]:
     """Weight w of each unknown, (size,) per field, such that the square of a field's norm is Σ w x²."""
-    found = {}
+    found: dict[str, Floats] = {}
     for name, size in scene.sizes.items():
         volumes = scene.cell_volumes.get(name)
         if volumes is None or not volumes.size or not (volumes > 0).all():

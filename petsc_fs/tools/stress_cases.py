@@ -319,7 +319,7 @@ def held_out() -> list[StressCase]:
 def _drawn(number: int) -> tuple[list[str], np.random.Generator]:
     """The two or three random changes of a held-out case, of `CHANGES`, and what draws their numbers."""
     random = np.random.default_rng([SEED, 1000 + number])
-    shuffled: list[str] = random.permutation(list(CHANGES)).tolist()
+    shuffled = [str(change) for change in random.permutation(list(CHANGES))]
     return shuffled[: int(random.integers(2, 4))], random
 
 
