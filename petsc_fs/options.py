@@ -40,7 +40,7 @@ OWN = (
     *(ALLOW_UNUSED, "qr_side", "ksp_monitor", "ksp_monitor_true_residual", "ksp_view", "ksp_converged_reason"),
 )
 """Options that somebody may mean at the outermost level although no shipped file has them."""
-FIXED_STRESS = ("fs_type", "fs_damping", "fs_drop")
+FIXED_STRESS = ("fs_type", "fs_damping", "fs_fractures", "fs_drop")
 """Options of a FixedStress."""
 AT_ANY_LEVEL = (
     *(f"ksp_{name}" for name in ("type", "rtol", "atol", "max_it", "gmres_restart")),
@@ -56,6 +56,7 @@ NUMBERS: dict[str, tuple[float, float, bool]] = {
     "ksp_gmres_restart": (1, math.inf, True),
     "component_drop": (0.0, 1.0, False),
     "fs_drop": (0.0, 1.0, False),
+    "fs_fractures": (0.0, math.inf, False),
 }
 """Least value, value that is too large, and whether it is a whole number, of options that end in these names."""
 NO_OPTION = "is not an option; options start with '-'"
@@ -252,7 +253,10 @@ WITHOUT_HYPRE = "contact_poromechanics_gamg.opts"
 REST = "qr_fieldsplit_1_"
 STRESS = tuple(f"{REST}fieldsplit_1_{name}" for name in (*FIXED_STRESS, "pc_python_type"))
 LEFT_OUT: dict[str, tuple[str, ...]] = {
-    "no contact: Q_r and the first Schur level left out": ("qr_side", "qr_mechanics_", "qr_fieldsplit_contact_"),
+    "no contact: Q_r and the first Schur level left out": (
+        *("qr_side", "qr_mechanics_", "qr_fieldsplit_contact_"),
+        f"{REST}fieldsplit_1_fs_fractures",
+    ),
     "no mechanics: the second Schur level with fixed stress left out": (f"{REST}fieldsplit_mechanics_", *STRESS),
     "no flow: the second and third Schur levels left out": (f"{REST}fieldsplit_1_",),
     "mechanics and flow decoupled: fixed stress left out": STRESS,
@@ -355,6 +359,8 @@ def cut(canonical: Mapping[str, str | None], facts: Facts) -> Options:
     node = {name: value for name, value in node.items() if f"fs_{name}" not in FIXED_STRESS and name != "ksp_type"}
     if mechanics and "mass" in flow and facts.flow_moves_rock and facts.rock_moves_flow:
         own = {k: v for k, v in stress.items() if not k.startswith("fs_") or k in FIXED_STRESS}
+        if "contact" not in facts.fields:
+            own.pop("fs_fractures", None)
         node = own | _put("fs_", node)
     members = list(flow)
     if mechanics:

@@ -8,8 +8,10 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from sample import SCENES, csr, dense
 
+from petsc_fs import nest
 from petsc_fs.io import hdf5
 from petsc_fs.options import find_options_file, inserted
+from petsc_fs.pc import FixedStress, fixed_stress
 from petsc_fs.pc.algebraic import SHARE, stabilisation
 from petsc_fs.scene import CSR, Scene
 from petsc_fs.solver import Solver
@@ -161,3 +163,26 @@ def test_scenes_without_material_data_take_no_more_iterations(clean, file, name,
         with_data, without = Solver(scene).solve(), Solver(bare).solve()
     assert without.converged
     assert without.iterations <= with_data.iterations + 1
+
+
+@pytest.mark.mpi
+def test_fractures_may_have_a_multiple_of_it(clean, model2):
+    """And rock what it has anyway."""
+    added = {}
+    for factor in ("0", "3"):
+        with inserted({"qr_fieldsplit_1_fieldsplit_1_fs_fractures": factor}):
+            with inserted(find_options_file("contact_poromechanics.opts")):
+                solver = Solver(model2)
+                solver.set_up()
+            found = [pc for pc in nest.levels(solver.ksp.getPC()) if pc.getType() == "python"]
+            (pc,) = [pc for pc in found if isinstance(pc.getPythonContext(), FixedStress)]
+        complement, operator = pc.getOperators()
+        before, after = operator, pc.getPythonContext().inners[0].getOperators()[1]
+        mass, S = (nest.blocks_of(M)["mass", "mass"] for M in (before, after))
+        added[factor] = S.getDiagonal().getArray() - mass.getDiagonal().getArray()
+        rock = mass.query("fixed_stress_ratio").getArray() != 1.0
+        algebraic = stabilisation(*fixed_stress._mechanics(complement, 1, mass.getSizes()[0], ""))
+    limit = 1e-12 * abs(mass.getDiagonal().getArray()).max(initial=0.0)
+    np.testing.assert_allclose(abs(added["3"][~rock]), 3 * algebraic[~rock], rtol=1e-8, atol=limit)
+    np.testing.assert_array_equal(added["3"][rock], added["0"][rock])
+    assert comm.allreduce(np.count_nonzero(abs(added["3"]) > 10 * abs(added["0"]))) > 10

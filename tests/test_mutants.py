@@ -25,7 +25,7 @@ ITERATIONS = {
     "contact_mechanics_fast": {"contact": 18},
     "contact_poromechanics": {"model1": 20, "model2": 18, "model3": 30},
     "contact_poromechanics_fast": {"model1": 24, "model2": 22, "model3": 38},
-    "contact_poromechanics_gamg": {"model1": 55, "model2": 38, "model3": 50},
+    "contact_poromechanics_gamg": {"model1": 36, "model2": 38, "model3": 51},
     "contact_poromechanics_left": {"model1": 30, "model2": 19, "model3": 30},
     "fixed_stress_richardson": {"model1": 17},
     "flow": {"flow": 8},

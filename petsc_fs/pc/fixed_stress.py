@@ -33,6 +33,9 @@ class FixedStress(WrapperPC):
             alone, see `petsc_fs.pc.algebraic`; the operator must be the Schur complement that PCFIELDSPLIT makes,
             which knows the blocks of mechanics.
         -fs_damping <0.6>: the exponent; 1 is the paper's formula, 0.6 what its published code uses.
+        -fs_fractures <0>: where not 0, cells of fractures have this multiple of the algebraic value in place of the
+            analytic one, which leaves out that fractures open as their pressure rises. That of cells which open one by
+            one is the algebraic one; fractures open as a whole, more easily.
         -fs_drop <0>: entries of the block of pressure less than this share of the diagonal of their row are left out,
             see `petsc_fs.pc.sparser`; 0 keeps all.
         -fs_*: of the inner PC.
@@ -41,6 +44,7 @@ class FixedStress(WrapperPC):
     prefix = "fs_"
     kind = "analytic"
     damping = PUBLISHED_DAMPING
+    fractures = 0.0
 
     def build(self, pc: PETSc.PC) -> PETSc.Mat:
         """S^2. Collective.
@@ -63,6 +67,7 @@ class FixedStress(WrapperPC):
         kinds = ("analytic", "algebraic") if base is not None else ("algebraic", "analytic")
         self.kind = choice(pc, "fs_type", kinds)
         self.damping = PETSc.Options(prefix).getReal("fs_damping", PUBLISHED_DAMPING)
+        self.fractures = PETSc.Options(prefix).getReal("fs_fractures", 0)
         mechanics = (complement, k if whole else None, block.getSizes()[0], prefix)
         if self.kind == "algebraic":
             values = stabilisation(*_mechanics(*mechanics))
@@ -70,7 +75,10 @@ class FixedStress(WrapperPC):
             shape = np.ones(base.getLocalSize()) if ratio is None else ratio.getArray()
             values = base.getArray() * shape**self.damping
             if complement.getType() == "schurcomplement":
-                values = checked(values, shape != 1.0, stabilisation(*_mechanics(*mechanics)))
+                algebraic, rock = stabilisation(*_mechanics(*mechanics)), shape != 1.0
+                values = checked(values, rock, algebraic)
+                if self.fractures and ratio is not None:
+                    values = np.where(rock, values, self.fractures * algebraic)
         else:
             raise UsageError(
                 f"-{prefix}fs_type analytic: the block of {field} has no vector 'fixed_stress_base' (a scene without "
@@ -95,7 +103,8 @@ class FixedStress(WrapperPC):
     def describe(self) -> str:
         """The diagonal in one line."""
         damping = f", damping exponent {self.damping:g}" if self.kind == "analytic" else ""
-        return f"{self.kind} fixed-stress diagonal on the mass block{damping}"
+        fractures = f", in fractures {self.fractures:g} times the algebraic one" if self.fractures else ""
+        return f"{self.kind} fixed-stress diagonal on the mass block{damping}{fractures}"
 
 
 def checked(
