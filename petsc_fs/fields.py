@@ -1,10 +1,12 @@
-"""The fields of contact poromechanics: the one table that names them.
+"""The fields of contact poromechanics with heat and wells: the one table that names them.
 
-A new field is one more row here, its mapping from the simulator, and a level in an options file.
+A new field is one more row here, its mapping from the simulator, and a level in an options file. What has no row, such
+as the fraction of a tracer, is a field as well: `other_NAME`, one unknown per place.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -17,8 +19,8 @@ class Field:
 
     Attributes:
         name: HDF5 group, name in the DM, option prefix and row of the report.
-        index: number of the field in the paper, J_ij (Zabegaev et al., arXiv:2501.07441).
-        vector: whether there is one unknown per coordinate direction and cell, or one per cell.
+        index: number of the field in the paper, J_ij (Zabegaev et al., arXiv:2501.07441); beyond it they count on.
+        components: unknowns per cell; 0 for one per coordinate direction.
         unknown: what the columns are.
         equation: what the rows are.
         unit: SI unit of the unknown.
@@ -26,31 +28,58 @@ class Field:
 
     name: str
     index: int
-    vector: bool
+    components: int
     unknown: str
     equation: str
     unit: str
 
     def block_size(self, dimension: int) -> int:
         """Unknowns per cell in a domain of this dimension."""
-        return dimension if self.vector else 1
+        return self.components or dimension
 
 
 FIELDS = (
-    Field("contact", 1, True, "contact traction per fracture cell", "contact conditions C_n, C_tau", "1"),
-    Field("intf_force", 2, True, "interface displacement", "interface force balance", "m"),
-    Field("momentum", 3, True, "displacement of the rock", "momentum balance", "m"),
-    Field("intf_flow", 4, False, "interface Darcy flux", "interface Darcy law", "m^3/s"),
-    Field("mass", 5, False, "pressure in rock, fractures and intersections", "fluid mass balance", "Pa"),
+    Field("contact", 1, 0, "contact traction per fracture cell", "contact conditions C_n, C_tau", "1"),
+    Field("intf_force", 2, 0, "interface displacement", "interface force balance", "m"),
+    Field("momentum", 3, 0, "displacement of the rock", "momentum balance", "m"),
+    Field("intf_flow", 4, 1, "interface Darcy flux", "interface Darcy law", "m^3/s"),
+    Field("intf_energy", 7, 2, "interface Fourier and enthalpy flux", "interface Fourier law, advection", "W"),
+    Field("well_flow", 8, 1, "flux between well and fracture", "Peaceman's well model", "m^3/s"),
+    Field("well_energy", 9, 1, "enthalpy flux between well and fracture", "advection", "W"),
+    Field("mass", 5, 1, "pressure in rock, fractures and intersections", "fluid mass balance", "Pa"),
+    Field("energy", 6, 1, "temperature in rock, fractures and intersections", "energy balance", "K"),
 )
-FIELD = {field.name: field for field in FIELDS}
-FIELD_NAMES = tuple(FIELD)
+"""In the order of elimination; `in_order` puts others behind them."""
+FIELD_NAMES = tuple(field.name for field in FIELDS)
+
+
+class _Table(dict[str, Field]):
+    """Fields by name; those of the pattern `OTHER` are made when asked for."""
+
+    def __contains__(self, name: object) -> bool:
+        return super().__contains__(name) or bool(re.fullmatch(OTHER, str(name)))
+
+    def __missing__(self, name: str) -> Field:
+        if name not in self:
+            raise KeyError(name)
+        what = name.partition("_")[2]
+        return Field(name, len(FIELDS) + 1, 1, what, f"equation of {what}", "")
+
+
+OTHER = r"other_\w+"
+"""Names of fields that the table does not have."""
+FIELD = _Table({field.name: field for field in FIELDS})
 
 ALIASES: dict[str, str] = {}
 """Fields by other names that files have for them, see `learn_aliases`."""
 
 MECHANICS = ("intf_force", "momentum")
 """Fields that one multigrid treats together, under the name "mechanics"."""
+FLUXES = ("intf_flow", "intf_energy", "well_flow", "well_energy")
+"""Fields of fluxes between subdomains, which are eliminated together, under the name "fluxes"."""
+POTENTIALS = ("mass", "energy")
+"""Pressure and temperature, under the name "potentials" where both are there."""
+FLOW = (*FLUXES, *POTENTIALS)
 
 
 def field_of(name: str) -> str:
@@ -75,6 +104,7 @@ def learn_aliases(text: str) -> None:
 
 
 def in_order(names: Iterable[str]) -> tuple[str, ...]:
-    """The given field names in the order of the table."""
+    """The given field names in the order of the table, others behind them by name."""
     present = set(names)
-    return tuple(name for name in FIELD_NAMES if name in present)
+    others = sorted(name for name in present if name in FIELD and name not in FIELD_NAMES)
+    return (*(name for name in FIELD_NAMES if name in present), *others)

@@ -188,7 +188,7 @@ class Scene:
         if width not in (None, n):
             raise LayoutError(f"matrix: has {n} rows and {width} columns, and must be square")
         check_csr(whole, n, n, "matrix")
-        for unknown in set(fields) - set(FIELD_NAMES):
+        for unknown in (f for f in fields if f not in FIELD):
             raise LayoutError(f"unknown field {unknown!r}; fields are {', '.join(FIELD_NAMES)}")
         if columns is not None and set(columns) != set(fields):
             raise LayoutError(f"columns are given for {', '.join(columns)}; rows for {', '.join(fields)}")

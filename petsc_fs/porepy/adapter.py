@@ -7,7 +7,8 @@ no order of blocks is assumed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -29,24 +30,43 @@ Indices = NDArray[np.int64]
 
 STICKING, SLIDING, OPEN = range(3)
 
+ALL = slice(None)
+
 VARIABLES = {
-    "contact_traction_variable": "contact",
-    "interface_displacement_variable": "intf_force",
-    "displacement_variable": "momentum",
-    "interface_darcy_flux_variable": "intf_flow",
-    "pressure_variable": "mass",
+    "contact_traction_variable": ("contact", ALL),
+    "interface_displacement_variable": ("intf_force", ALL),
+    "displacement_variable": ("momentum", ALL),
+    "interface_darcy_flux_variable": ("intf_flow", ALL),
+    "interface_fourier_flux_variable": ("intf_energy", slice(0, 1)),
+    "interface_enthalpy_flux_variable": ("intf_energy", slice(1, 2)),
+    "well_flux_variable": ("well_flow", ALL),
+    "well_enthalpy_flux_variable": ("well_energy", ALL),
+    "pressure_variable": ("mass", ALL),
+    "enthalpy_variable": ("energy", ALL),
+    "temperature_variable": ("energy", ALL),
 }
-"""Attribute in which a PorePy model keeps the name of an unknown, to the field of the unknown."""
+"""Attribute in which a PorePy model keeps the name of an unknown, to the field and the components of a cell that it is;
+of two for the same components the first one that the model has."""
 
 EQUATIONS = {
     "normal_fracture_deformation_equation": ("contact", slice(0, 1)),
     "tangential_fracture_deformation_equation": ("contact", slice(1, None)),
-    "interface_force_balance_equation": ("intf_force", slice(None)),
-    "momentum_balance_equation": ("momentum", slice(None)),
-    "interface_darcy_flux_equation": ("intf_flow", slice(None)),
-    "mass_balance_equation": ("mass", slice(None)),
+    "interface_force_balance_equation": ("intf_force", ALL),
+    "momentum_balance_equation": ("momentum", ALL),
+    "interface_darcy_flux_equation": ("intf_flow", ALL),
+    "interface_fourier_flux_equation": ("intf_energy", slice(0, 1)),
+    "interface_enthalpy_flux_equation": ("intf_energy", slice(1, 2)),
+    "well_flux_equation": ("well_flow", ALL),
+    "well_enthalpy_flux_equation": ("well_energy", ALL),
+    "mass_balance_equation": ("mass", ALL),
+    "energy_balance_equation": ("energy", ALL),
 }
 """Name of an equation in PorePy, to its field and the components of a cell that it provides."""
+
+Places = dict[Any, Indices]
+"""Per grid rows or columns of PorePy's matrix, (cells, unknowns of a cell)."""
+MATERIAL = ("biot_coefficient", "fluid_compressibility", "shear_modulus", "lame_lambda")
+"""Laws without which a model with mechanics has no analytic fixed-stress diagonal."""
 
 
 class Adapter:
@@ -55,17 +75,16 @@ class Adapter:
     Within a field, grids come by descending dimension and otherwise in the order of the
     mixed-dimensional grid; a vector field lists all components of a cell before the next cell.
     Contact rows and columns are normal first, then tangential; PorePy's tractions are in the local
-    basis of the fracture with the normal last.
+    basis of the fracture with the normal last. An unknown that is not in the table becomes a field `other_NAME`, with
+    the equation of its grids that is called alike, or else the first one that is left.
 
     The maps are computed once, and again only if unknowns, equations or grids have changed.
 
     Args:
-        model: any PorePy model made of (some of) contact mechanics, momentum balance and
-            single-phase flow, after `prepare_simulation`.
+        model: any PorePy model, after `prepare_simulation`.
 
     Raises:
-        LayoutError: the model has an unknown or equation that belongs to no field, or the unknowns
-            and equations of a field do not live on the same grids.
+        LayoutError: unknowns and equations do not pair up.
         SceneError: the model is not prepared.
     """
 
@@ -123,8 +142,8 @@ class Adapter:
             sizes={f: rows.size for f, rows in self._rows.items()},
             blocks=self._cut.blocks(matrix, self._rows, self._columns),
             rhs={f: rhs[rows] for f, rows in self._rows.items()},
-            cell_centers={f: np.concatenate([g.cell_centers.T for g in gs]) for f, gs in cells.items()},
-            cell_volumes={f: np.concatenate([g.cell_volumes for g in gs]) for f, gs in cells.items()},
+            cell_centers=self._of_cells(lambda g: g.cell_centers.T),
+            cell_volumes=self._of_cells(lambda g: g.cell_volumes),
             cell_dimension=_dimensions(cells["mass"]) if "mass" in cells else None,
             contact_state=contact_state(model, cells["contact"]) if "contact" in cells else None,
             material=self._material() if "mass" in cells else None,
@@ -168,91 +187,82 @@ class Adapter:
         )
         if structure == self._structure:
             return
-        self._check_supported(structure)
-        columns = self._find_columns(variables)
-        rows = self._find_rows(equations)
+        fields = self._pairs(variables, equations)
+        position = {g: i for i, g in enumerate([*self.model.mdg.subdomains(), *self.model.mdg.interfaces()])}
         self._grids: dict[str, list[Any]] = {}
         self._rows: dict[str, Indices] = {}
         self._columns: dict[str, Indices] = {}
-        position = {g: i for i, g in enumerate([*self.model.mdg.subdomains(), *self.model.mdg.interfaces()])}
-        for name in in_order({*columns, *rows}):
-            if columns.get(name, {}).keys() != rows.get(name, {}).keys():
-                raise LayoutError(
-                    f"{name}: {len(columns.get(name, {}))} grids have the unknown, "
-                    f"{len(rows.get(name, {}))} the equation; they must be the same grids"
-                )
-            grids = sorted(columns[name], key=lambda g: (-g.dim, position[g]))
+        for name in in_order(fields):
+            rows, columns = fields[name]
+            grids = sorted(columns, key=lambda g: (-g.dim, position[g]))
             self._grids[name] = grids
-            self._rows[name] = np.concatenate([rows[name][g].ravel() for g in grids])
-            self._columns[name] = np.concatenate([columns[name][g].ravel() for g in grids])
-            if (self._rows[name] < 0).any():
-                raise LayoutError(f"{name}: the model has only some of the equations of this field")
+            self._rows[name] = np.concatenate([rows[g].ravel() for g in grids])
+            self._columns[name] = np.concatenate([columns[g].ravel() for g in grids])
         self._structure = structure
 
-    def _names(self) -> dict[str, str]:
-        """Name of an unknown in this model, to its field."""
-        return {getattr(self.model, a): f for a, f in VARIABLES.items() if hasattr(self.model, a)}
+    def _pairs(
+        self, variables: list[tuple[str, Any, Indices]], equations: Mapping[str, Mapping[Any, Indices]]
+    ) -> dict[str, tuple[Places, Places]]:
+        """Rows and columns of each field, by the table, and those of what is left by grids and names."""
+        columns: dict[str, Places] = {}
+        for variable, grid, dofs in variables:
+            if dofs.size:
+                columns.setdefault(variable, {})[grid] = dofs
+        rows: dict[str, Places] = {}
+        offset = 0
+        for equation in self.model.equation_system.equations:
+            parts = equations[equation]
+            rows[equation] = {g: offset + local for g, local in parts.items() if local.size}
+            offset += sum(local.size for local in parts.values())
+        unknowns: dict[str, tuple[str, slice]] = {}
+        for attribute, place in VARIABLES.items():
+            if (name := getattr(self.model, attribute, None)) in columns and place not in unknowns.values():
+                unknowns[name] = place
+        found: dict[str, tuple[Places, Places]] = {}
+        for field in dict.fromkeys(field for field, _ in unknowns.values()):
+            sides = [
+                self._joined(field, {n: parts for n, parts in side.items() if table.get(n, ("",))[0] == field}, table)
+                for side, table in ((rows, EQUATIONS), (columns, unknowns))
+            ]
+            if sides[0] is not None and sides[1] is not None and sides[0].keys() == sides[1].keys():
+                found[field] = sides[0], sides[1]
+                for side, table in ((rows, EQUATIONS), (columns, unknowns)):
+                    for name in [n for n in side if table.get(n, ("",))[0] == field]:
+                        del side[name]
+        if "contact" in found:
+            found["contact"] = found["contact"][0], {g: np.roll(c, 1, axis=1) for g, c in found["contact"][1].items()}
+        return found | _others(rows, columns)
 
-    def _check_supported(self, structure: tuple[list[Any], list[Any]]) -> None:
-        known = self._names()
-        variables = sorted({name for name, _, size in structure[0] if size and name not in known})
-        equations = sorted({name for name, _, size in structure[1] if size and name not in EQUATIONS})
-        found = [
-            f"{what} {', '.join(names)}" for what, names in (("unknowns", variables), ("equations", equations)) if names
-        ]
-        if found:
-            raise LayoutError(
-                f"the model has {' and '.join(found)}, which are not supported; supported are the unknowns "
-                f"{', '.join(known)} and the equations {', '.join(EQUATIONS)}"
-            )
+    def _joined(self, field: str, parts: Mapping[str, Places], table: Mapping[str, tuple[str, slice]]) -> Places | None:
+        """Per grid what several unknowns or equations have, component by component; None if that is not all of it."""
+        found: Places = {}
+        for name, places in parts.items():
+            for grid, numbers in places.items():
+                here = found.setdefault(grid, np.full((grid.num_cells, self._block_size(field)), -1, dtype=np.int64))
+                own = here[:, table[name][1]]
+                if own.size != numbers.size:
+                    return None
+                here[:, table[name][1]] = numbers.reshape(own.shape)
+        return None if any((numbers < 0).any() for numbers in found.values()) else found
 
     def _block_size(self, name: str) -> int:
         return FIELD[name].block_size(self.model.nd)
 
-    def _find_columns(self, variables: list[tuple[str, Any, Indices]]) -> dict[str, dict[Any, Indices]]:
-        """Per field and grid the columns, (cells, block size)."""
-        known = self._names()
-        found: dict[str, dict[Any, Indices]] = {}
-        for variable, grid, dofs in variables:
-            if not dofs.size:
-                continue
-            name = known[variable]
-            bs = self._block_size(name)
-            if dofs.size != grid.num_cells * bs:
-                raise LayoutError(
-                    f"{name}: {dofs.size} unknowns on a grid of {grid.num_cells} cells, expected {bs} per cell"
-                )
-            per_cell: Indices = dofs.reshape(grid.num_cells, bs)
-            if name == "contact":
-                per_cell = np.roll(per_cell, 1, axis=1)
-            found.setdefault(name, {})[grid] = per_cell
+    def _of_cells(self, data: Callable[[Any], Floats]) -> dict[str, Floats]:
+        """Data of the cells of each field; of others for each unknown, left out where they are not in cells."""
+        found = {}
+        for field, grids in self._grids.items():
+            count, more = divmod(self._rows[field].size, self._block_size(field) * sum(g.num_cells for g in grids))
+            if not more:
+                found[field] = np.repeat(np.concatenate([data(g) for g in grids]), count, axis=0)
         return found
 
-    def _find_rows(self, equations: Mapping[str, Mapping[Any, Indices]]) -> dict[str, dict[Any, Indices]]:
-        """Per field and grid the rows, (cells, block size); -1 where there is no equation."""
-        found: dict[str, dict[Any, Indices]] = {}
-        offset = 0
-        for equation in self.model.equation_system.equations:
-            for grid, local in equations[equation].items():
-                if not local.size:
-                    continue
-                name, components = EQUATIONS[equation]
-                shape = (grid.num_cells, self._block_size(name))
-                here = found.setdefault(name, {}).setdefault(grid, np.full(shape, -1, dtype=np.int64))
-                width = here[:, components].shape[1]
-                if local.size != grid.num_cells * width:
-                    raise LayoutError(
-                        f"{name}: {equation} has {local.size} rows on a grid of {grid.num_cells} cells, "
-                        f"expected {width} per cell"
-                    )
-                here[:, components] = (offset + local).reshape(grid.num_cells, width)
-            offset += sum(local.size for local in equations[equation].values())
-        return found
-
-    def _material(self) -> Material:
+    def _material(self) -> Material | None:
         """Data of the fixed-stress diagonals; the Biot coefficient of a model without mechanics is 0."""
         model, subdomains = self.model, self._grids["mass"]
         moving = "momentum" in self._grids
+        if not all(hasattr(model, law) for law in MATERIAL[0 if moving else 1 : 4 if moving else 2]):
+            return None
 
         def elastic(name: str) -> float | Floats:
             return _per_cell(model, getattr(model, name), subdomains) if moving else solid(model, name)
@@ -333,6 +343,36 @@ class _Cut:
         return found
 
 
+def _others(rows: dict[str, Places], columns: dict[str, Places]) -> dict[str, tuple[Places, Places]]:
+    """Unknowns with the equations of as many rows on the same grids, those first whose names have most in common.
+
+    Raises:
+        LayoutError: some are left.
+    """
+    left = {(e, g): index for e, places in rows.items() for g, index in places.items()}
+    found: dict[str, tuple[Places, Places]] = {}
+
+    def likeness(variable: str, equation: str) -> int:
+        return 2 if variable in equation else int(variable.rpartition("_")[2] in equation)
+
+    wanted = [(v, g, index) for v, places in columns.items() for g, index in places.items()]
+    for alike in (2, 1, 0):
+        for variable, grid, index in list(wanted):
+            fitting = [k for k, r in left.items() if k[1] is grid and r.size == index.size]
+            fitting = [k for k in fitting if likeness(variable, k[0]) >= alike]
+            if fitting:
+                mine, theirs = found.setdefault("other_" + re.sub(r"\W", "_", variable), ({}, {}))
+                mine[grid], theirs[grid] = left.pop(fitting[0]), index
+                wanted.remove((variable, grid, index))
+    if wanted or left:
+        unknowns, equations = (", ".join(sorted({k[0] for k in part})) or "none" for part in (wanted, left))
+        raise LayoutError(
+            "unknowns and equations of the model do not pair up, grid by grid; left are the unknowns "
+            f"{unknowns} and the equations {equations}"
+        )
+    return found
+
+
 def _rows(matrix: Any, index: Indices) -> CSR:
     """Some rows of a matrix; without a copy of entries where they follow each other."""
     if index.size and (np.diff(index) == 1).all():
@@ -347,7 +387,7 @@ def scene_from_model(model: Any) -> Scene:
     """The current linear system of a PorePy model as a scene; see `Adapter`.
 
     Raises:
-        LayoutError: the model has unknowns or equations that belong to no field.
+        LayoutError: unknowns and equations of the model do not pair up.
         SceneError: the model has no linear system yet.
     """
     return Adapter(model).scene()

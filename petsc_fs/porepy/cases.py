@@ -54,6 +54,13 @@ class Rock:
     fluid_density: float = 998.2
     fluid_viscosity: float = 1.002e-3
     reference_pressure: float = 1e6
+    reference_temperature: float = 393.15
+    heat_capacity: float = 720.7
+    thermal_conductivity: float = 0.1
+    thermal_expansion: float = 9.66e-6
+    fluid_heat_capacity: float = 4182.0
+    fluid_thermal_conductivity: float = 0.5975
+    fluid_thermal_expansion: float = 2.068e-4
 
     @property
     def specific_storage(self) -> float:
@@ -81,7 +88,7 @@ class Case:
     """Geometry, loads and time of one model.
 
     Attributes:
-        equations: "poromechanics", "mechanics" or "flow".
+        equations: "poromechanics", "thermoporomechanics", "mechanics" or "flow".
         dimension: of the domain, a square or cube of edge `SIDE`.
         fractures: traces in the x-y plane; in 3D they are extruded over `extent` in z.
         extent: lower and upper z of the fractures, as fractions of the domain.
@@ -95,9 +102,11 @@ class Case:
         newton_iterations: at most so many a time step.
         opening: displacement of the north side where it is held too, in m at the end: `opening` along
             x and `opening` (x / SIDE - 1/2) along y, in proportion to time. None: north carries `traction`.
+        injection: water that flows into the middle of the first fracture, in kg/s (in 2D per metre of depth).
+        cooling: by how much it is colder than the rock, in K.
     """
 
-    equations: Literal["poromechanics", "mechanics", "flow"] = "poromechanics"
+    equations: Literal["poromechanics", "thermoporomechanics", "mechanics", "flow"] = "poromechanics"
     dimension: int = 2
     fractures: tuple[Segment, ...] = ()
     extent: tuple[float, float] = (0.2, 0.8)
@@ -110,6 +119,8 @@ class Case:
     time_steps: int = 6
     newton_iterations: int = 100
     opening: float | None = None
+    injection: float = 0.0
+    cooling: float = 80.0
 
 
 CASES: dict[str, Case] = {
@@ -145,6 +156,23 @@ CASES: dict[str, Case] = {
         traction=3e6,
         time_step=DAY,
         opening=0.5,
+    ),
+    "cold2": Case(
+        equations="thermoporomechanics",
+        fractures=FOUR_FRACTURES,
+        traction=3e6,
+        fracture_permeability="cubic",
+        time_step=DAY,
+        injection=1e-2,
+    ),
+    "cold3": Case(
+        equations="thermoporomechanics",
+        dimension=3,
+        fractures=FOUR_FRACTURES,
+        traction=3e6,
+        fracture_permeability="cubic",
+        time_step=WEEK,
+        injection=1.0,
     ),
 }
 """Name of a model to its set-up."""

@@ -6,7 +6,7 @@
 
 `model1` to `model3` are those of the paper (Zabegaev et al., arXiv:2501.07441); `biot` is model 1
 without its fracture, `flow` and `contact` are the two halves of the physics on the fractures of
-model 2.
+model 2. `cold2` and `cold3` inject cold water into the fractures of models 2 and 3.
 """
 
 from __future__ import annotations
@@ -196,13 +196,62 @@ class FlowLoads(pp.SolutionStrategy):
     def initial_condition(self) -> None:
         """Reference pressure everywhere."""
         super().initial_condition()
-        cells = sum(sd.num_cells for sd in self.mdg.subdomains())
-        values = np.full(cells, _scaled(self, self.parameters.rock.reference_pressure, "Pa"))
-        for which, indices in (("time_step", self.time_step_indices), ("iterate", self.iterate_indices)):
-            for i in indices:
-                self.equation_system.set_variable_values(
-                    values, variables=[self.pressure_variable], **{f"{which}_index": i}
-                )
+        _start_with(self, self.pressure_variable, _scaled(self, self.parameters.rock.reference_pressure, "Pa"))
+
+
+class ColdInjection(pp.SolutionStrategy):
+    """Cold water flows into a fracture; the border keeps the temperature that everything starts with."""
+
+    case: Case
+    parameters: ModelParameters
+
+    def bc_type_fourier_flux(self, sd: Any) -> Any:
+        """Temperature is given on all sides."""
+        return pp.BoundaryCondition(sd, self.domain_boundary_sides(sd).all_bf, "dir")
+
+    def bc_type_enthalpy_flux(self, sd: Any) -> Any:
+        """Temperature is given on all sides."""
+        return pp.BoundaryCondition(sd, self.domain_boundary_sides(sd).all_bf, "dir")
+
+    def bc_values_temperature(self, bg: Any) -> Floats:
+        """Reference temperature."""
+        return np.full(bg.num_cells, _scaled(self, self.parameters.rock.reference_temperature, "K"))
+
+    def initial_condition(self) -> None:
+        """Reference temperature everywhere."""
+        super().initial_condition()
+        _start_with(self, self.temperature_variable, _scaled(self, self.parameters.rock.reference_temperature, "K"))
+
+    def fluid_source(self, subdomains: list[Any]) -> Any:
+        """Mass per time and cell."""
+        return super().fluid_source(subdomains) + pp.ad.DenseArray(self._injected(subdomains))
+
+    def energy_source(self, subdomains: list[Any]) -> Any:
+        """Enthalpy per time and cell, counted from the reference temperature."""
+        enthalpy = _scaled(self, -self.parameters.rock.fluid_heat_capacity * self.case.cooling, "J * kg^-1")
+        return super().energy_source(subdomains) + pp.ad.DenseArray(enthalpy * self._injected(subdomains))
+
+    def _injected(self, subdomains: list[Any]) -> Floats:
+        """Mass per time and cell: all of it into the fracture cell that is nearest to the middle of the first fracture."""
+        x0, y0, x1, y1 = self.case.fractures[0]
+        middle = SIDE * np.array([(x0 + x1) / 2, (y0 + y1) / 2, sum(self.case.extent) / 2 * (self.nd == 3)])
+        far = [
+            np.linalg.norm(sd.cell_centers.T - middle, axis=1) + (0 if sd.dim == self.nd - 1 else np.inf)
+            for sd in subdomains
+        ]
+        distance = np.concatenate(far) if far else np.zeros(0)
+        found = np.zeros(distance.size)
+        if np.isfinite(distance).any():
+            found[np.argmin(distance)] = _scaled(self, self.case.injection, "kg * s^-1")
+        return found
+
+
+def _start_with(model: Any, variable: str, value: float) -> None:
+    """Give an unknown the same value in all cells, at all times and iterates that are kept."""
+    values = np.full(sum(sd.num_cells for sd in model.mdg.subdomains()), value)
+    for which, indices in (("time_step", model.time_step_indices), ("iterate", model.iterate_indices)):
+        for i in indices:
+            model.equation_system.set_variable_values(values, variables=[variable], **{f"{which}_index": i})
 
 
 class CasePermeability(pp.constitutive_laws.CubicLawPermeability):
@@ -285,6 +334,20 @@ class PoromechanicsModel(
     """Fluid mass, momentum and frictional contact."""
 
 
+class ThermoporomechanicsModel(
+    NoFiles,
+    CaseGeometry,
+    MechanicsLoads,
+    ContactConstant,
+    FlowLoads,
+    ColdInjection,
+    CasePermeability,
+    solution_strategy.ContactIndicators,
+    pp.thermoporomechanics.Thermoporomechanics,
+):
+    """Fluid mass, energy, momentum and frictional contact."""
+
+
 class MechanicsModel(
     NoFiles,
     CaseGeometry,
@@ -302,6 +365,7 @@ class FlowModel(NoFiles, CaseGeometry, FlowLoads, CasePermeability, pp.SinglePha
 
 CLASSES: dict[str, type] = {
     "poromechanics": PoromechanicsModel,
+    "thermoporomechanics": ThermoporomechanicsModel,
     "mechanics": MechanicsModel,
     "flow": FlowModel,
 }
@@ -448,18 +512,26 @@ def _materials(parameters: ModelParameters) -> dict[str, Any]:
         "maximum_elastic_fracture_opening": (
             rock.maximum_elastic_fracture_opening if parameters.normal_stiffness else 0.0
         ),
+        "specific_heat_capacity": rock.heat_capacity,
+        "thermal_conductivity": rock.thermal_conductivity,
+        "thermal_expansion": rock.thermal_expansion,
     }
     fluid = {
         "compressibility": rock.fluid_compressibility,
         "density": rock.fluid_density,
         "viscosity": rock.fluid_viscosity,
+        "specific_heat_capacity": rock.fluid_heat_capacity,
+        "thermal_conductivity": rock.fluid_thermal_conductivity,
+        "thermal_expansion": rock.fluid_thermal_expansion,
     }
     if CONSTANTS_ARE_METHODS:
         # The tolerance is what later releases of PorePy have by default.
         contact = {"open_state_tolerance": 1e-10, "characteristic_displacement": rock.characteristic_displacement}
         return {
-            "solid": pp.SolidConstants(solid | contact),
-            "fluid": pp.FluidConstants(fluid | {"pressure": rock.reference_pressure}),
+            "solid": pp.SolidConstants(solid | contact | {"temperature": rock.reference_temperature}),
+            "fluid": pp.FluidConstants(
+                fluid | {"pressure": rock.reference_pressure, "temperature": rock.reference_temperature}
+            ),
         }
     return {
         "solid": pp.SolidConstants(**solid),
@@ -472,5 +544,6 @@ def _reference_values(parameters: ModelParameters) -> dict[str, Any]:
     """PorePy's `reference_variable_values`, which 1.10 keeps with the fluid instead."""
     if CONSTANTS_ARE_METHODS:
         return {}
-    values = pp.ReferenceVariableValues(pressure=parameters.rock.reference_pressure)
+    rock = parameters.rock
+    values = pp.ReferenceVariableValues(pressure=rock.reference_pressure, temperature=rock.reference_temperature)
     return {"reference_variable_values": values}

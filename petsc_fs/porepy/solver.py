@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petsc_fs import options, server
-from petsc_fs.errors import LayoutError, SolveError, UsageError
+from petsc_fs.errors import SolveError, UsageError
 from petsc_fs.memory import return_freed
 from petsc_fs.porepy.forcing import EisenstatWalker, EisenstatWalkerParameters
 from petsc_fs.scene import Scene, contact_state_counts
@@ -50,9 +50,6 @@ RETRY_FILE = "retry.opts"
 
 FIRST = "first solve: "
 """How the note of a solve that was tried again begins."""
-
-FOREIGN = ("temperature_variable", "enthalpy_variable")
-"""Attributes in which PorePy's models keep the names of unknowns that no field is for."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +138,6 @@ class FieldSplitSolver:
 
     Raises:
         UsageError: of the class statement, where a base with a linear solver of PorePy's goes before this one.
-        LayoutError: of the construction, where the model is known to have an unknown that no field is for.
     """
 
     params: dict[str, Any]
@@ -161,8 +157,6 @@ class FieldSplitSolver:
         self._client = server.join()
         return_freed()  # or the process grows with each Newton step: PorePy frees what malloc then keeps
         super().__init__(*args, **kwargs)
-        if unknown := [getattr(self, name) for name in FOREIGN if hasattr(self, name)]:
-            raise LayoutError(f"{type(self).__name__} has the unknown {', '.join(unknown)}, which is not supported")
         self.linear_solves = []
         self._adapter: Adapter | None = None
         self._solver: server.ServedSolver | None = None
@@ -173,7 +167,7 @@ class FieldSplitSolver:
         self._reference_residual: Floats | None = None
 
     def discretize(self) -> None:
-        """PorePy's own, once it is clear that the model has no unknowns or equations but ours."""
+        """PorePy's own, once it is clear that unknowns and equations of the model pair up."""
         self._prepare_adapter()
         super().discretize()  # type: ignore[misc]
 
@@ -181,7 +175,7 @@ class FieldSplitSolver:
         """The Newton update, in PorePy's order.
 
         Raises:
-            LayoutError: the model has unknowns or equations that belong to no field.
+            LayoutError: unknowns and equations of the model do not pair up.
             SceneError: the linear system has entries that are not finite.
             UsageError: the options file cannot be used, or has an option that nothing asked for.
             SolveError: PETSc failed, the solution is not finite, or -petsc_fs_on_failure ends the run.
