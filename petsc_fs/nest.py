@@ -122,9 +122,14 @@ def field_dm(A: PETSc.Mat) -> PETSc.DMShell:
     as option prefix (`fieldsplit_contact_`), a split of several its number (`fieldsplit_1_`). (PETSc can do that for a
     MatNest without a DM since 3.22, but without names.)
 
-    Collective. A diagonal block that is a MatNest is a field like any other, and splits into its own fields.
+    Collective. A diagonal block that is a MatNest is a field like any other, and splits into its own fields; one that
+    has the attribute `COMPONENTS` (`PETSc.Object.setAttr`) splits into those.
     """
     return _shell([_Field.of(A.getNestSubMatrix(i, i)) for i in range(A.getNestSize()[0])], A.comm)
+
+
+COMPONENTS = "petsc_fs_components"
+"""Names of the unknowns of a cell, one for each."""
 
 
 class _Field:
@@ -135,21 +140,27 @@ class _Field:
         local: rows on this rank.
         total: rows on all ranks.
         block_size: of the block.
-        members: the fields of a block that is a MatNest.
+        members: the fields of a block that is a MatNest, or its components.
+        interleaved: whether the members are components.
     """
 
     def __init__(self, name: str, sizes: tuple[int, int], block_size: int, members: list[_Field]) -> None:
         self.name, self.block_size, self.members = name, block_size, members
         self.local, self.total = sizes
+        self.interleaved = False
 
     @classmethod
     def of(cls, block: PETSc.Mat) -> _Field:
         count = block.getNestSize()[0] if block.getType() == "nest" else 0
         members = [cls.of(block.getNestSubMatrix(i, i)) for i in range(count)]
-        return cls(block.getName(), block.getSizes()[0], block.getBlockSize(), members)
+        field = cls(block.getName(), block.getSizes()[0], block.getBlockSize(), members)
+        if components := block.getAttr(COMPONENTS):
+            sizes = field.local // len(components), field.total // len(components)
+            field.members, field.interleaved = [cls(name, sizes, 1, []) for name in components], True
+        return field
 
 
-def _shell(fields: list[_Field], comm: Any) -> PETSc.DMShell:
+def _shell(fields: list[_Field], comm: Any, *, interleaved: bool = False) -> PETSc.DMShell:
     local = [f.local for f in fields]
     dm = PETSc.DMShell().create(comm=comm)
     vector = PETSc.Vec().createMPI((sum(local), sum(f.total for f in fields)), comm=comm)
@@ -157,7 +168,10 @@ def _shell(fields: list[_Field], comm: Any) -> PETSc.DMShell:
     offsets = vector.getOwnershipRange()[0] + np.concatenate([[0], np.cumsum(local)])
 
     def index_set(ids: Sequence[int]) -> PETSc.IS:
-        indices = np.concatenate([np.arange(offsets[i], offsets[i + 1]) for i in ids])
+        if interleaved:
+            indices = np.sort([np.arange(offsets[0] + i, offsets[-1], len(fields)) for i in ids], axis=None)
+        else:
+            indices = np.concatenate([np.arange(offsets[i], offsets[i + 1]) for i in ids])
         found = PETSc.IS().createGeneral(indices.astype(PETSc.IntType), comm=comm)
         sizes = {fields[i].block_size for i in ids}
         found.setBlockSize(sizes.pop() if len(sizes) == 1 else 1)
@@ -165,7 +179,9 @@ def _shell(fields: list[_Field], comm: Any) -> PETSc.DMShell:
 
     def sub_dm(ids: Sequence[int]) -> PETSc.DMShell:
         part = [fields[i] for i in ids]
-        return _shell(part[0].members if len(part) == 1 and part[0].members else part, comm)
+        if len(part) == 1 and part[0].members:
+            return _shell(part[0].members, comm, interleaved=part[0].interleaved)
+        return _shell(part, comm, interleaved=interleaved)
 
     def decomposition(_: PETSc.DM) -> tuple[list[str], list[PETSc.IS], list[PETSc.DM]]:
         every = range(len(fields))

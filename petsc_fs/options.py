@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from petsc_fs.errors import UsageError, together
-from petsc_fs.fields import FIELD_NAMES, MECHANICS, in_order
+from petsc_fs.fields import FIELD_NAMES, FLOW, FLUXES, MECHANICS, POTENTIALS, in_order
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -29,7 +29,7 @@ Number = TypeVar("Number", int, float)
 Options = dict[str, str | None]
 """Values by full name, without the dash; None where an option has no value."""
 
-SPLIT = r"(?<!pc_)fieldsplit_(?:intf_force|intf_flow|[A-Za-z]+|\d+)_"
+SPLIT = rf"(?<!pc_)fieldsplit_(?:{'|'.join(FIELD_NAMES)}|[A-Za-z]+|\d+)_"
 """The prefix of one split in an option name, but not PCFIELDSPLIT's own `pc_fieldsplit_0_fields`."""
 AT_THE_END = ("options_left", "options_view", "get_total_flops", "objects_view", "mpidump", "citations", "skip_petscrc")
 """Options that PETSc asks for only in PetscFinalize, or before anybody can see it."""
@@ -245,11 +245,13 @@ def check(values: Mapping[str, str | None]) -> None:
 
 # Which file for which fields
 
-FLOW = ("intf_flow", "mass")
 CANONICAL = "contact_poromechanics_fast.opts"
 """Options file with all levels."""
 WITHOUT_HYPRE = "contact_poromechanics_gamg.opts"
 """The same for a PETSc that lacks hypre."""
+HOT = "contact_thermoporomechanics_fast.opts"
+"""The same for scenes with heat or wells."""
+ISOTHERMAL = {"contact", *MECHANICS, "intf_flow", "mass"}
 REST = "qr_fieldsplit_1_"
 STRESS = tuple(f"{REST}fieldsplit_1_{name}" for name in (*FIXED_STRESS, "pc_python_type"))
 LEFT_OUT: dict[str, tuple[str, ...]] = {
@@ -261,7 +263,10 @@ LEFT_OUT: dict[str, tuple[str, ...]] = {
     "no flow: the second and third Schur levels left out": (f"{REST}fieldsplit_1_",),
     "mechanics and flow decoupled: fixed stress left out": STRESS,
     "mechanics and flow act one way only: fixed stress left out": STRESS,
-    "no interface flow: the third Schur level left out": (f"{REST}fieldsplit_1_fs_fieldsplit_intf_flow_",),
+    "no interface flow: the third Schur level left out": (
+        f"{REST}fieldsplit_1_fs_fieldsplit_intf_flow_",
+        f"{REST}fieldsplit_1_fs_joined_fieldsplit_fluxes_",
+    ),
 }
 """What a scene may make superfluous of the canonical solver, with the beginnings of its options there."""
 NO_CONTACT, NO_MECHANICS, NO_FLOW, DECOUPLED, ONE_WAY, NO_INTERFACE_FLOW = LEFT_OUT
@@ -305,8 +310,10 @@ class Facts:
             yield NO_FLOW
         elif mechanics and not (self.flow_moves_rock and self.rock_moves_flow):
             yield ONE_WAY if self.flow_moves_rock or self.rock_moves_flow else DECOUPLED
-        if flow and "intf_flow" not in self.fields:
+        if flow and not any(f in self.fields for f in FLUXES):
             yield NO_INTERFACE_FLOW
+        if others := ", ".join(f for f in self.fields if f not in FIELD_NAMES):
+            yield f"no file has a place for {others}: solved after all others, by ILU"
 
 
 @dataclass(frozen=True)
@@ -334,11 +341,11 @@ def choose(facts: Facts) -> Choice:
 
     if not facts.fields:
         raise UsageError("the scene has no unknowns, there is nothing to solve")
-    canonical = shipped_folder() / CANONICAL
+    canonical = shipped_folder() / (CANONICAL if set(facts.fields) <= ISOTHERMAL else HOT)
     files = [file.path for file in shipped() if file.default and file.fields == facts.fields]
     if not PETSc.Sys.hasExternalPackage("hypre"):
         canonical = shipped_folder() / WITHOUT_HYPRE
-        files = [canonical] if facts.fields == FIELD_NAMES else []
+        files = [canonical] if read_header(canonical).fields == facts.fields else []
     left_out = tuple(facts.left_out())
     if files and not {DECOUPLED, ONE_WAY} & set(left_out):
         return Choice(parse(files[0]), files[0], left_out)
@@ -354,9 +361,8 @@ def cut(canonical: Mapping[str, str | None], facts: Facts) -> Options:
     outer = {name: value for name, value in canonical.items() if name.startswith("ksp_")}
     transform = {"contact", "intf_force"} <= set(facts.fields)
 
-    inner = _under(stress, "fs_")
-    node = inner if len(flow) == len(FLOW) else _under(inner, f"fieldsplit_{flow[0]}_") if flow else {}
-    node = {name: value for name, value in node.items() if f"fs_{name}" not in FIXED_STRESS and name != "ksp_type"}
+    inner = {name: value for name, value in _under(stress, "fs_").items() if f"fs_{name}" not in FIXED_STRESS}
+    node = _flow(inner, flow) if flow else {}
     if mechanics and "mass" in flow and facts.flow_moves_rock and facts.rock_moves_flow:
         own = {k: v for k, v in stress.items() if not k.startswith("fs_") or k in FIXED_STRESS}
         if "contact" not in facts.fields:
@@ -367,7 +373,7 @@ def cut(canonical: Mapping[str, str | None], facts: Facts) -> Options:
         leaf = _under(level_2, "fieldsplit_mechanics_")
         names = ["mechanics"] if transform else list(mechanics)
         if len(names) > 1 and leaf.get("pc_type") != "python":
-            leaf = {"pc_type": "python", "pc_python_type": "petsc_fs.pc.Assembled", **_put("assembled_", leaf)}
+            leaf = _wrapped("Assembled", leaf)
         exact = not (facts.flow_moves_rock or facts.rock_moves_flow)
         node = _split(level_2, names, leaf, node, members, additive=exact) if members else leaf
         members = [*names, *members]
@@ -377,7 +383,34 @@ def cut(canonical: Mapping[str, str | None], facts: Facts) -> Options:
     node.pop("ksp_type", None)
     if transform:
         node = {k: v for k, v in canonical.items() if k.startswith(("pc_", "qr_side", "qr_mech"))} | _put("qr_", node)
+    known, others = ([f for f in facts.fields if (f in FIELD_NAMES) == there] for there in (True, False))
+    if others:
+        ilu = {"pc_type": "asm", "pc_asm_overlap": "1", "sub_ksp_type": "preonly", "sub_pc_type": "ilu"}
+        leaf = ilu if len(others) == 1 else _wrapped("Assembled", ilu)
+        level = {"pc_type": "fieldsplit", "pc_fieldsplit_type": "multiplicative"}
+        node = _split(level, known, node, leaf, others) if known else leaf
     return outer | node
+
+
+def _flow(inner: Options, flow: tuple[str, ...]) -> Options:
+    """Fluxes between subdomains, and pressure and temperature: those that there are, several of a kind as one."""
+    joined = _under(inner, "joined_") or inner
+    fluxes, potentials = ([f for f in part if f in flow] for part in (FLUXES, POTENTIALS))
+    first = _under(joined, "fieldsplit_fluxes_") or _under(joined, "fieldsplit_intf_flow_")
+    last = _under(joined, "fieldsplit_potentials_") or _under(joined, "fieldsplit_mass_")
+    if len(potentials) == 1:
+        last = _under(last, f"sub_0_fieldsplit_{potentials[0]}_") or last
+    names = [part[:1] if len(part) == 1 else [name] for part, name in ((fluxes, "fluxes"), (potentials, "potentials"))]
+    node = first if fluxes else last
+    if fluxes and potentials:
+        node = _split(joined, names[0], first, last, names[1])
+    node = {name: value for name, value in node.items() if name != "ksp_type"}
+    return _wrapped("Joined", node) if max(len(fluxes), len(potentials)) > 1 else node
+
+
+def _wrapped(name: str, node: Options) -> Options:
+    """A node inside a Python PC of this package."""
+    return {"pc_type": "python", "pc_python_type": f"petsc_fs.pc.{name}", **_put(f"{name.lower()}_", node)}
 
 
 def _split(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, get_args
 
 from petsc_fs.errors import UsageError
@@ -70,6 +70,8 @@ class Rock:
 
 
 ROCK = Rock()
+PERMEABLE_ROCK = Rock(permeability=1e-13, residual_aperture=1e-3, fracture_gap=1e-3, reference_pressure=5e6)
+"""Which takes up water, and with it cold, faster."""
 
 Segment = tuple[float, float, float, float]
 """x and y of the start, then of the end, of a fracture trace, as fractions of the domain."""
@@ -104,6 +106,7 @@ class Case:
             x and `opening` (x / SIDE - 1/2) along y, in proportion to time. None: north carries `traction`.
         injection: water that flows into the middle of the first fracture, in kg/s (in 2D per metre of depth).
         cooling: by how much it is colder than the rock, in K.
+        rock: material constants.
     """
 
     equations: Literal["poromechanics", "thermoporomechanics", "mechanics", "flow"] = "poromechanics"
@@ -121,6 +124,7 @@ class Case:
     opening: float | None = None
     injection: float = 0.0
     cooling: float = 80.0
+    rock: Rock = ROCK
 
 
 CASES: dict[str, Case] = {
@@ -160,19 +164,21 @@ CASES: dict[str, Case] = {
     "cold2": Case(
         equations="thermoporomechanics",
         fractures=FOUR_FRACTURES,
-        traction=3e6,
+        traction=1.2e7,
         fracture_permeability="cubic",
-        time_step=DAY,
-        injection=1e-2,
+        time_step=0.25 * HOUR,
+        injection=0.1,
+        rock=PERMEABLE_ROCK,
     ),
     "cold3": Case(
         equations="thermoporomechanics",
         dimension=3,
         fractures=FOUR_FRACTURES,
-        traction=3e6,
+        traction=1.2e7,
         fracture_permeability="cubic",
-        time_step=WEEK,
-        injection=1.0,
+        time_step=HOUR,
+        injection=20.0,
+        rock=PERMEABLE_ROCK,
     ),
 }
 """Name of a model to its set-up."""
@@ -190,7 +196,7 @@ class ModelParameters:
         physics: "full", or "restricted" to a linearised fluid mass and constant permeability.
         fracture_permeability: "unit" (1 m^2, which is what the published runs of models 1 and 2
             solve), "cubic" (cubic law) or "constant" (as the rock); None for the model's own.
-        rock: material constants.
+        rock: material constants; None for the model's own.
     """
 
     refinement: float = 1.0
@@ -199,7 +205,7 @@ class ModelParameters:
     pressure_ratio: float | None = None
     physics: Physics = "full"
     fracture_permeability: FracturePermeability | None = None
-    rock: Rock = field(default=ROCK)
+    rock: Rock | None = None
 
     def __post_init__(self) -> None:
         if not self.refinement > 0:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from petsc_fs.errors import SolveError, UsageError
 from petsc_fs.porepy import require_porepy
-from petsc_fs.porepy.cases import CASES, CELL, CONTACT_SCALING, MASS_UNIT, SIDE, Case, ModelParameters, find_case
+from petsc_fs.porepy.cases import CASES, CELL, CONTACT_SCALING, MASS_UNIT, SIDE, Case, ModelParameters, Rock, find_case
 
 require_porepy()
 
@@ -182,6 +182,7 @@ class FlowLoads(pp.SolutionStrategy):
 
     case: Case
     parameters: ModelParameters
+    rock: Rock
 
     def bc_type_fluid_flux(self, sd: Any) -> Any:
         """Pressure, and with it density and mobility, are given on all sides."""
@@ -189,21 +190,21 @@ class FlowLoads(pp.SolutionStrategy):
 
     def bc_values_pressure(self, bg: Any) -> Floats:
         """Reference pressure, in the east times the ratio of the case."""
-        values = np.full(bg.num_cells, _scaled(self, self.parameters.rock.reference_pressure, "Pa"))
+        values = np.full(bg.num_cells, _scaled(self, self.rock.reference_pressure, "Pa"))
         values[self.domain_boundary_sides(bg).east] *= _pressure_ratio(self.case, self.parameters)
         return values
 
     def initial_condition(self) -> None:
         """Reference pressure everywhere."""
         super().initial_condition()
-        _start_with(self, self.pressure_variable, _scaled(self, self.parameters.rock.reference_pressure, "Pa"))
+        _start_with(self, self.pressure_variable, _scaled(self, self.rock.reference_pressure, "Pa"))
 
 
 class ColdInjection(pp.SolutionStrategy):
     """Cold water flows into a fracture; the border keeps the temperature that everything starts with."""
 
     case: Case
-    parameters: ModelParameters
+    rock: Rock
 
     def bc_type_fourier_flux(self, sd: Any) -> Any:
         """Temperature is given on all sides."""
@@ -215,12 +216,12 @@ class ColdInjection(pp.SolutionStrategy):
 
     def bc_values_temperature(self, bg: Any) -> Floats:
         """Reference temperature."""
-        return np.full(bg.num_cells, _scaled(self, self.parameters.rock.reference_temperature, "K"))
+        return np.full(bg.num_cells, _scaled(self, self.rock.reference_temperature, "K"))
 
     def initial_condition(self) -> None:
         """Reference temperature everywhere."""
         super().initial_condition()
-        _start_with(self, self.temperature_variable, _scaled(self, self.parameters.rock.reference_temperature, "K"))
+        _start_with(self, self.temperature_variable, _scaled(self, self.rock.reference_temperature, "K"))
 
     def fluid_source(self, subdomains: list[Any]) -> Any:
         """Mass per time and cell."""
@@ -228,11 +229,11 @@ class ColdInjection(pp.SolutionStrategy):
 
     def energy_source(self, subdomains: list[Any]) -> Any:
         """Enthalpy per time and cell, counted from the reference temperature."""
-        enthalpy = _scaled(self, -self.parameters.rock.fluid_heat_capacity * self.case.cooling, "J * kg^-1")
+        enthalpy = _scaled(self, -self.rock.fluid_heat_capacity * self.case.cooling, "J * kg^-1")
         return super().energy_source(subdomains) + pp.ad.DenseArray(enthalpy * self._injected(subdomains))
 
     def _injected(self, subdomains: list[Any]) -> Floats:
-        """Mass per time and cell: all of it into the fracture cell that is nearest to the middle of the first fracture."""
+        """Mass per time and cell: all into the fracture cell that is nearest to the middle of the first fracture."""
         x0, y0, x1, y1 = self.case.fractures[0]
         middle = SIDE * np.array([(x0 + x1) / 2, (y0 + y1) / 2, sum(self.case.extent) / 2 * (self.nd == 3)])
         far = [
@@ -288,6 +289,7 @@ class RestrictedMass(pp.constitutive_laws.SpecificStorage):
     """
 
     parameters: ModelParameters
+    rock: Rock
 
     def fluid_mass(self, subdomains: list[Any]) -> Any:
         """Mass per cell as an AD operator."""
@@ -301,7 +303,7 @@ class RestrictedMass(pp.constitutive_laws.SpecificStorage):
         deformation = self.porosity_change_from_displacement(rock) + self._mpsa_consistency(
             rock, self.darcy_keyword, self.pressure_variable
         )
-        residual = self.parameters.rock.residual_aperture
+        residual = self.rock.residual_aperture
         width = [np.full(sd.num_cells, residual ** (self.nd - sd.dim)) for sd in lower]
         compression = (
             pp.ad.DenseArray(np.concatenate(width) if width else np.zeros(0))
@@ -312,9 +314,7 @@ class RestrictedMass(pp.constitutive_laws.SpecificStorage):
         volume = projection.cell_prolongation(rock) @ (storage + deformation)
         if lower:
             volume += projection.cell_prolongation(lower) @ (compression + self.specific_volume(lower))
-        density = pp.ad.Scalar(
-            _scaled(self, self.parameters.rock.fluid_density, "kg * m^-3"), "reference_fluid_density"
-        )
+        density = pp.ad.Scalar(_scaled(self, self.rock.fluid_density, "kg * m^-3"), "reference_fluid_density")
         mass = volume * self.wrap_grid_attribute(subdomains, "cell_volumes", dim=1) * density
         mass.set_name("fluid_mass")
         return mass
@@ -396,13 +396,13 @@ def make_model(
         parameters = ModelParameters(**changes)
     elif changes:
         raise UsageError("make_model: give either `parameters` or keyword arguments")
-    own = CLASSES[case.equations]
+    rock, own = parameters.rock or case.rock, CLASSES[case.equations]
     cls = type(own.__name__, (*mixins, own), {})
     changed = parameters.changes()
     end = case.time_step * case.time_steps
     model = cls(
         {
-            "material_constants": _materials(parameters),
+            "material_constants": _materials(rock, parameters),
             "grid_type": "simplex",
             "meshing_arguments": {"cell_size": CELL / parameters.refinement},
             "time_manager": pp.TimeManager(schedule=[0, end], dt_init=case.time_step, constant_dt=True, iter_max=25),
@@ -410,10 +410,10 @@ def make_model(
             "linear_solver": "pypardiso" if find_spec("pypardiso") else "scipy_sparse",
             "adaptive_indicator_scaling": 1,
         }
-        | _reference_values(parameters)
+        | _reference_values(rock)
     )
     model.case = case
-    model.parameters = parameters
+    model.parameters, model.rock = parameters, rock
     model.scene_name = f"{name} ({changed})" if changed else name
     return model
 
@@ -499,9 +499,8 @@ def _scaled(model: Any, value: float, units: str) -> float:
     return float(converter.convert_units(value, units))
 
 
-def _materials(parameters: ModelParameters) -> dict[str, Any]:
+def _materials(rock: Rock, parameters: ModelParameters) -> dict[str, Any]:
     """PorePy's `material_constants`."""
-    rock = parameters.rock
     names = (
         "shear_modulus", "lame_lambda", "biot_coefficient", "porosity", "density", "permeability",
         "normal_permeability", "dilation_angle", "residual_aperture", "fracture_gap", "specific_storage",
@@ -540,10 +539,9 @@ def _materials(parameters: ModelParameters) -> dict[str, Any]:
     }
 
 
-def _reference_values(parameters: ModelParameters) -> dict[str, Any]:
+def _reference_values(rock: Rock) -> dict[str, Any]:
     """PorePy's `reference_variable_values`, which 1.10 keeps with the fluid instead."""
     if CONSTANTS_ARE_METHODS:
         return {}
-    rock = parameters.rock
     values = pp.ReferenceVariableValues(pressure=rock.reference_pressure, temperature=rock.reference_temperature)
     return {"reference_variable_values": values}
