@@ -168,12 +168,13 @@ def _shell(fields: list[_Field], comm: Any, *, interleaved: bool = False) -> PET
     offsets = vector.getOwnershipRange()[0] + np.concatenate([[0], np.cumsum(local)])
 
     def index_set(ids: Sequence[int]) -> PETSc.IS:
+        sizes = {fields[i].block_size for i in ids}
         if interleaved:
             indices = np.sort([np.arange(offsets[0] + i, offsets[-1], len(fields)) for i in ids], axis=None)
+            sizes = {len(ids)}
         else:
             indices = np.concatenate([np.arange(offsets[i], offsets[i + 1]) for i in ids])
         found = PETSc.IS().createGeneral(indices.astype(PETSc.IntType), comm=comm)
-        sizes = {fields[i].block_size for i in ids}
         found.setBlockSize(sizes.pop() if len(sizes) == 1 else 1)
         return found
 

@@ -399,7 +399,7 @@ def _flow(inner: Options, flow: tuple[str, ...]) -> Options:
     first = _under(joined, "fieldsplit_fluxes_") or _under(joined, "fieldsplit_intf_flow_")
     last = _under(joined, "fieldsplit_potentials_") or _under(joined, "fieldsplit_mass_")
     if len(potentials) == 1:
-        last = _under(last, f"sub_0_fieldsplit_{potentials[0]}_") or last
+        last = _under(last, f"fieldsplit_{potentials[0]}_") or last
     names = [part[:1] if len(part) == 1 else [name] for part, name in ((fluxes, "fluxes"), (potentials, "potentials"))]
     node = first if fluxes else last
     if fluxes and potentials:
