@@ -385,9 +385,9 @@ def cut(canonical: Mapping[str, str | None], facts: Facts) -> Options:
         node = {k: v for k, v in canonical.items() if k.startswith(("pc_", "qr_side", "qr_mech"))} | _put("qr_", node)
     known, others = ([f for f in facts.fields if (f in FIELD_NAMES) == there] for there in (True, False))
     if others:
-        ilu = {"pc_type": "asm", "pc_asm_overlap": "1", "sub_ksp_type": "preonly", "sub_pc_type": "ilu"}
+        ilu: Options = {"pc_type": "asm", "pc_asm_overlap": "1", "sub_ksp_type": "preonly", "sub_pc_type": "ilu"}
         leaf = ilu if len(others) == 1 else _wrapped("Assembled", ilu)
-        level = {"pc_type": "fieldsplit", "pc_fieldsplit_type": "multiplicative"}
+        level: Options = {"pc_type": "fieldsplit", "pc_fieldsplit_type": "multiplicative"}
         node = _split(level, known, node, leaf, others) if known else leaf
     return outer | node
 

@@ -102,6 +102,7 @@ class Case:
         time_step: in s.
         time_steps: number of them.
         newton_iterations: at most so many a time step.
+        newton_tolerance: of the residual, as PorePy measures it.
         opening: displacement of the north side where it is held too, in m at the end: `opening` along
             x and `opening` (x / SIDE - 1/2) along y, in proportion to time. None: north carries `traction`.
         injection: water that flows into the middle of the first fracture, in kg/s (in 2D per metre of depth).
@@ -121,6 +122,7 @@ class Case:
     time_step: float
     time_steps: int = 6
     newton_iterations: int = 100
+    newton_tolerance: float = 1e-7
     opening: float | None = None
     injection: float = 0.0
     cooling: float = 80.0
@@ -166,8 +168,9 @@ CASES: dict[str, Case] = {
         fractures=FOUR_FRACTURES,
         traction=1.2e7,
         fracture_permeability="cubic",
-        time_step=0.25 * HOUR,
-        injection=0.1,
+        time_step=HOUR,
+        newton_tolerance=1e-10,
+        injection=0.03,
         rock=PERMEABLE_ROCK,
     ),
     "cold3": Case(
@@ -177,6 +180,7 @@ CASES: dict[str, Case] = {
         traction=1.2e7,
         fracture_permeability="cubic",
         time_step=HOUR,
+        newton_tolerance=1e-10,
         injection=20.0,
         rock=PERMEABLE_ROCK,
     ),

@@ -42,12 +42,11 @@ CONSTANTS_ARE_METHODS = hasattr(pp, "FluidConstants")
 NEWTON = {
     "progressbars": False,
     "nl_convergence_tol": float("inf"),
-    "nl_convergence_tol_res": 1e-7,
     "nl_divergence_tol": 1e8,
     "Global_line_search": 1,
     "Local_line_search": 1,
 }
-"""Newton settings of the paper's runs; the number of iterations is that of the case."""
+"""Newton settings of the paper's runs; number of iterations and tolerance are those of the case."""
 
 
 class StopRun(Exception):
@@ -443,16 +442,14 @@ def run(
     """
     if not hasattr(model, "equation_system"):
         model.prepare_simulation()
-    settings = (
-        NEWTON
-        | {
-            "max_iterations": model.case.newton_iterations,
-            # Flow has no contact constraints to search along.
-            "nonlinear_solver": pp.NewtonSolver if isinstance(model, FlowModel) else ConstraintLineSearch,
-            "prepare_simulation": False,
-        }
-        | newton
-    )
+    own = {
+        "max_iterations": model.case.newton_iterations,
+        "nl_convergence_tol_res": model.case.newton_tolerance,
+        # Flow has no contact constraints to search along.
+        "nonlinear_solver": pp.NewtonSolver if isinstance(model, FlowModel) else ConstraintLineSearch,
+        "prepare_simulation": False,
+    }
+    settings = own | NEWTON | newton
     with _hooked(model, on_newton_step, linear_solve):
         try:
             pp.run_time_dependent_model(model, settings)
