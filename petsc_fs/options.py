@@ -247,10 +247,10 @@ def check(values: Mapping[str, str | None]) -> None:
 
 CANONICAL = "contact_poromechanics_fast.opts"
 """Options file with all levels."""
-WITHOUT_HYPRE = "contact_poromechanics_gamg.opts"
-"""The same for a PETSc that lacks hypre."""
 HOT = "contact_thermoporomechanics_fast.opts"
 """The same for scenes with heat or wells."""
+WITHOUT_HYPRE = {CANONICAL: "contact_poromechanics_gamg.opts", HOT: "contact_thermoporomechanics_gamg.opts"}
+"""The same for a PETSc that lacks hypre."""
 ISOTHERMAL = {"contact", *MECHANICS, "intf_flow", "mass"}
 REST = "qr_fieldsplit_1_"
 STRESS = tuple(f"{REST}fieldsplit_1_{name}" for name in (*FIXED_STRESS, "pc_python_type"))
@@ -341,10 +341,11 @@ def choose(facts: Facts) -> Choice:
 
     if not facts.fields:
         raise UsageError("the scene has no unknowns, there is nothing to solve")
-    canonical = shipped_folder() / (CANONICAL if set(facts.fields) <= ISOTHERMAL else HOT)
+    name = CANONICAL if set(facts.fields) <= ISOTHERMAL else HOT
+    canonical = shipped_folder() / name
     files = [file.path for file in shipped() if file.default and file.fields == facts.fields]
     if not PETSc.Sys.hasExternalPackage("hypre"):
-        canonical = shipped_folder() / WITHOUT_HYPRE
+        canonical = shipped_folder() / WITHOUT_HYPRE[name]
         files = [canonical] if read_header(canonical).fields == facts.fields else []
     left_out = tuple(facts.left_out())
     if files and not {DECOUPLED, ONE_WAY} & set(left_out):

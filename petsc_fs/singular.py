@@ -18,6 +18,13 @@ Labels = dict[str, NDArray[np.int64]]
 
 NULL = 1e-12
 """Part of |A| |v| in an equation that rounding explains."""
+GROUPS = (
+    (("intf_flow", "well_flow", "mass"), ("mass",)),
+    (("intf_energy", "well_energy", "energy"), ("energy",)),
+    (MECHANICS, MECHANICS),
+)
+"""Fields whose blocks make up the parts, and those of them that a null vector is in."""
+SCALARS = {"mass": "pressure", "energy": "temperature"}
 MOST = 12
 """Parts that are looked at one by one; a system with more is called by the first of them."""
 
@@ -39,14 +46,14 @@ class NullVector:
 
 
 def null_vectors(system: System) -> list[NullVector]:
-    """Constant pressures and rigid motions of connected parts that no equation notices. Collective.
+    """Constant pressures and temperatures, and rigid motions, of connected parts that no equation notices. Collective.
 
-    The parts are those of the pattern of the blocks of pressure and interface flux, and of displacements; couplings
-    between them, as by contact, count when the whole matrix is applied.
+    The parts are those of the pattern of the blocks of `GROUPS`; couplings between these, as by contact, count when the
+    whole matrix is applied.
     """
     found = []
     fields = system.layout.fields
-    for group, kinds in ((("mass", "intf_flow"), ("mass",)), (MECHANICS, MECHANICS)):
+    for group, kinds in GROUPS:
         there = tuple(f for f in fields if f in group)
         if not any(f in kinds for f in there):
             continue
@@ -107,10 +114,10 @@ def components(system: System, fields: Sequence[str]) -> tuple[Labels, NDArray[n
 
 
 def modes(system: System, fields: Sequence[str]) -> Iterator[tuple[str, FieldArrays]]:
-    """Constant pressure; or translations, and rotations where coordinates are known. Local."""
+    """Constant pressure or temperature; or translations, and rotations where coordinates are known. Local."""
     layout = system.layout
-    if "mass" in fields:
-        yield "pressure", {f: np.ones(layout.sizes(f)[0]) for f in fields}
+    if fields[0] in SCALARS:
+        yield SCALARS[fields[0]], {f: np.ones(layout.sizes(f)[0]) for f in fields}
         return
     D = layout.dimension
     for k in range(D):

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from petsc_fs.errors import UsageError
-from petsc_fs.fields import FIELD
+from petsc_fs.fields import FIELD, FLUXES, POTENTIALS
 from petsc_fs.scene import CONTACT_STATES, Floats, Integers, Scene, singular_diagonal_blocks
 
 
@@ -121,8 +122,9 @@ def stages(scene: Scene) -> list[tuple[str, dict[tuple[str, str], str]]]:
         original = {rc: v for rc, v in original.items() if not {"momentum", "intf_force"} & set(rc)}
         original |= {("mass", "mass"): "changed"}
         steps.append(("$S^2$", original))
-    if "intf_flow" in scene.sizes:
-        steps.append(("$S^3$", {("mass", "mass"): "changed"}))
+    if any(f in scene.sizes for f in FLUXES):
+        left = [f for f in POTENTIALS if f in scene.sizes]
+        steps.append(("$S^3$", dict.fromkeys(product(left, left), "changed")))
     return steps
 
 

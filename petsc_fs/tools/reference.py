@@ -39,6 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petsc_fs.errors import LayoutError, PetscFsError, SceneError, SolveError
+from petsc_fs.fields import FLUXES, POTENTIALS
 from petsc_fs.io import hdf5
 from petsc_fs.io.files import complete
 from petsc_fs.options import inserted
@@ -50,8 +51,6 @@ Solve = Callable[[Floats], Floats]
 
 LARGE = {2: 400_000, 3: 40_000}
 """Number of unknowns, by dimension, from which the iterative method is the default."""
-FLUXES = ("intf_flow",)
-"""Fields whose unknowns are integrals over their cell."""
 SWEEPS = 10
 """Of the equilibration; each takes the square root of what is left of the bad scaling."""
 STEPS = 40
@@ -296,8 +295,9 @@ def weights(scene: Scene) -> dict[str, Floats]:
         if volumes is None or not volumes.size or not (volumes > 0).all():
             found[name] = np.ones(size)
             continue
-        dimension = scene.cell_dimension if name == "mass" else None
+        dimension = scene.cell_dimension if name in POTENTIALS else None
         groups = np.zeros(volumes.size, dtype=np.int64) if dimension is None else np.asarray(dimension)
+        # fluxes are integrals over their cell
         per_cell = 1.0 / volumes if name in FLUXES else volumes / np.bincount(groups, weights=volumes)[groups]
         found[name] = np.repeat(per_cell, scene.block_size(name))
     return found

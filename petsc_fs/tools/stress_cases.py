@@ -122,8 +122,13 @@ def base_units(scene: Scene, kg: float, m: float, s: float) -> tuple[float, floa
 def unknowns_in_units(scene: Scene, *, kg: float = 1.0, m: float = 1.0, s: float = 1.0) -> dict[str, float]:
     """What the unknowns of each field are multiplied by in other units; tractions are relative ones."""
     mass, length, time = base_units(scene, kg, m, s)
-    known = {"intf_force": length, "momentum": length, "intf_flow": length**3 / time, "mass": mass / length / time**2}
+    known = {"intf_force": length, "momentum": length, "mass": mass / length / time**2} | _fluxes(mass, length, time)
     return {f: known.get(f, 1.0) for f in scene.fields}
+
+
+def _fluxes(mass: float, length: float, time: float) -> dict[str, float]:
+    flow, power = length**3 / time, mass * length**2 / time**3
+    return {"intf_flow": flow, "well_flow": flow, "intf_energy": power, "well_energy": power}
 
 
 def in_units(scene: Scene, *, kg: float = 1.0, m: float = 1.0, s: float = 1.0) -> Scene:
@@ -133,7 +138,8 @@ def in_units(scene: Scene, *, kg: float = 1.0, m: float = 1.0, s: float = 1.0) -
     """
     mass, length, time = base_units(scene, kg, m, s)
     force, pressure = mass * length / time**2, mass / length / time**2
-    rows = {"intf_force": force, "momentum": force, "intf_flow": length**3 / time, "mass": mass / time}
+    rows = {"intf_force": force, "momentum": force, "mass": mass / time, "energy": force * length / time}
+    rows |= _fluxes(mass, length, time)
     found = with_material(
         scaled(scene, rows, unknowns_in_units(scene, kg=kg, m=m, s=s)),
         shear_modulus=pressure,
