@@ -125,7 +125,8 @@ def field_dm(A: PETSc.Mat) -> PETSc.DMShell:
     Collective. A diagonal block that is a MatNest is a field like any other, and splits into its own fields; one that
     has the attribute `COMPONENTS` (`PETSc.Object.setAttr`) splits into those.
     """
-    return _shell([_Field.of(A.getNestSubMatrix(i, i)) for i in range(A.getNestSize()[0])], A.comm)
+    whole = _Field.of(A)
+    return _shell(whole.members, A.comm, interleaved=whole.interleaved)
 
 
 COMPONENTS = "petsc_fs_components"

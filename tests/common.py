@@ -23,6 +23,7 @@ FILE = {
     "undrained": "poromechanics.opts",
     "flow": "flow.opts",
     "contact": "contact_mechanics.opts",
+    "cold2": "contact_thermoporomechanics.opts",
 }
 """Options file of the published configuration; contact_poromechanics.opts for other scenes."""
 __all__ = ["MPI", "SCENES", "Layout", "rows_of"]

@@ -25,7 +25,9 @@ from petsc_fs.scene import CSR, Scene
 from petsc_fs.solver import Result, Solver
 from petsc_fs.tools import stress_cases
 
-BUNDLED = ("biot", "contact", "flow", "model1", "model2", "model3")
+BUNDLED = ("biot", "cold2", "contact", "flow", "model1", "model2", "model3")
+WARM = ("contact", "intf_force", "momentum", "intf_flow", "mass")
+HOT = ("contact", "intf_force", "momentum", "intf_flow", "intf_energy", "mass", "energy")
 
 Levels = dict[str, str]
 """Type of each PC by its prefix."""
@@ -102,6 +104,16 @@ def coupled_levels(prefix: str, mechanics: str, *, intf_flow: bool, stress: bool
     }
 
 
+def joined_levels(prefix: str, *, fluxes: str, heat: bool) -> Levels:
+    """Fluxes as one, or one alone, and pressure with temperature or alone, below a prefix."""
+    inner = f"{prefix}joined_"
+    last = f"{inner}fieldsplit_{'potentials' if heat else 'mass'}_" if fluxes else inner
+    apart = {inner: "fieldsplit", f"{inner}fieldsplit_{fluxes}_": "asm"} if fluxes else {}
+    splits = {"mass": "hypre", "energy": "hypre", "2": "asm"}
+    both = {last: "fieldsplit"} | {f"{last}fieldsplit_{name}_": kind for name, kind in splits.items()}
+    return {prefix: "python"} | apart | (both if heat else {last: "hypre"})
+
+
 def contact_levels(prefix: str, rest: Levels) -> Levels:
     return {prefix: "fieldsplit", f"{prefix}fieldsplit_contact_": "pbjacobi", **rest}
 
@@ -122,7 +134,27 @@ SUBSETS: dict[tuple[str, ...], Levels] = {
     ("contact", "intf_force", "momentum"): CONTACT_MECHANICS,
     ("contact", "intf_force", "momentum", "mass"): TRANSFORM
     | contact_levels("qr_", coupled_levels("qr_fieldsplit_1_", "mechanics", intf_flow=False)),
-    ("contact", "intf_force", "momentum", "intf_flow", "mass"): FULL,
+    WARM: FULL,
+    ("mass", "energy"): joined_levels("", fluxes="", heat=True),
+    ("intf_flow", "intf_energy", "mass", "energy"): joined_levels("", fluxes="fluxes", heat=True),
+    ("intf_flow", "mass", "energy"): joined_levels("", fluxes="intf_flow", heat=True),
+    ("intf_flow", "intf_energy", "mass"): joined_levels("", fluxes="fluxes", heat=False),
+    ("momentum", "mass", "energy"): {
+        "": "fieldsplit",
+        **displacements("fieldsplit_momentum_"),
+        "fieldsplit_1_": "python",
+        **joined_levels("fieldsplit_1_fs_", fluxes="", heat=True),
+    },
+    HOT: TRANSFORM
+    | contact_levels(
+        "qr_",
+        {
+            "qr_fieldsplit_1_": "fieldsplit",
+            **displacements("qr_fieldsplit_1_fieldsplit_mechanics_"),
+            "qr_fieldsplit_1_fieldsplit_1_": "python",
+            **joined_levels("qr_fieldsplit_1_fieldsplit_1_fs_", fluxes="fluxes", heat=True),
+        },
+    ),
 }
 CLOSED = ("model3", ("contact", "intf_force", "momentum", "mass"))
 """Fractures of model3 without interface flow are closed vessels that fixed stress is not made for."""
@@ -168,7 +200,7 @@ class Solved:
         ksps = dict(re.findall(r"KSP Object: \((\w*)\) .*\n\s*type: (\w+)", self.view))
         assert ksps.pop("") == "gmres"
         assert set(ksps.values()) <= {"preonly"}
-        inner = {p for p in levels if p.endswith(("qr_", "fs_", "component_"))}
+        inner = {p for p in levels if p.endswith(("qr_", "fs_", "component_", "joined_"))}
         assert {p for p in ksps if not p.endswith("sub_")} == set(levels) - inner - {""}
         assert self.unused == []
 
@@ -189,8 +221,11 @@ def solve(clean, shared_tmp_path):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("name", ["model2", "model3"])
-@pytest.mark.parametrize("fields", SUBSETS, ids="-".join)
+@pytest.mark.parametrize(
+    ("name", "fields"),
+    [(n, f) for f in SUBSETS for n in (["cold2"] if set(f) - set(WARM) else ["model2", "model3"])],
+    ids=lambda v: v if isinstance(v, str) else "-".join(v),
+)
 def test_scene_without_some_fields_has_exactly_the_levels_of_the_others(solve, name, fields):
     solved = solve(smooth(load(name).only(fields)))
     solved.assert_smallest(SUBSETS[fields])
@@ -291,7 +326,7 @@ def test_ranks_see_together_what_the_whole_scene_is(name):
 
 # Options
 
-CANONICAL = options.parse(options.find_options_file(options.CANONICAL))
+CANONICAL, CANONICAL_HOT = (options.parse(options.find_options_file(f)) for f in (options.CANONICAL, options.HOT))
 DEFAULTS = [file for file in options.shipped() if file.default]
 
 
@@ -303,7 +338,8 @@ def both(fields: tuple[str, ...]) -> Facts:
 
 @pytest.mark.parametrize("file", DEFAULTS, ids=lambda file: file.path.stem)
 def test_what_is_cut_for_a_usual_set_of_fields_is_the_shipped_file(file):
-    assert options.cut(CANONICAL, both(file.fields)) == options.parse(file.path)
+    canonical = CANONICAL_HOT if "energy" in file.fields else CANONICAL
+    assert options.cut(canonical, both(file.fields)) == options.parse(file.path)
     choice = options.choose(both(file.fields))
     assert (choice.file, choice.values) == (file.path, options.parse(file.path))
 
@@ -313,7 +349,7 @@ def test_every_bundled_scene_has_a_shipped_file_by_default(name):
     scene = load(name)
     choice = choice_of(scene)
     assert choice.file in {file.path for file in DEFAULTS if file.fields == scene.fields}
-    assert (choice.left_out == ()) == (scene.fields == FIELD_NAMES)
+    assert (choice.left_out == ()) == (set(WARM) <= set(scene.fields))
 
 
 def test_a_petsc_without_hypre_gets_its_own_multigrid(monkeypatch):
@@ -321,7 +357,7 @@ def test_a_petsc_without_hypre_gets_its_own_multigrid(monkeypatch):
     for fields in SUBSETS:
         choice = options.choose(both(fields))
         assert "hypre" not in choice.values.values()
-        assert (choice.file is None) == (fields != FIELD_NAMES)
+        assert (choice.file is None) == (fields not in (WARM, HOT))
 
 
 def test_what_is_left_out_has_names_in_the_canonical_file():

@@ -156,7 +156,7 @@ class WrapperPC(BasePC):
             inner.setOptionsPrefix((pc.getOptionsPrefix() or "") + self.prefix)
             inner.incrementTabLevel(1, parent=pc)
             inner.setOperators(matrix, matrix)
-            if matrix.getType() == "nest":
+            if matrix.getType() == "nest" or matrix.getAttr(nest.COMPONENTS):
                 inner.setDM(nest.field_dm(matrix))
             inner.setFromOptions()
             self.inners = (inner,)
