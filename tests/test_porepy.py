@@ -26,6 +26,7 @@ from petsc_fs.scene import contact_state_counts
 
 pytestmark = pytest.mark.porepy
 
+HOT = ("contact", "intf_force", "momentum", "intf_flow", "intf_energy", "mass", "energy")
 ALL = ("contact", "intf_force", "momentum", "intf_flow", "mass")
 FIELDS = {
     "model1": ALL,
@@ -34,9 +35,12 @@ FIELDS = {
     "biot": ("momentum", "mass"),
     "flow": ("intf_flow", "mass"),
     "contact": ("contact", "intf_force", "momentum"),
+    "cold2": HOT,
+    "cold3": HOT,
 }
+BUNDLED = [name for name in FIELDS if name != "cold3"]
 WITH_CONTACT = [name for name, fields in FIELDS.items() if "contact" in fields]
-COARSE = {"model3": 0.25}
+COARSE = {"model3": 0.25, "cold3": 0.25}
 UNKNOWNS = {"model1": 798, "model2": 1260, "model3": 3154}
 """Of the published runs, at refinement 1 in 2D and 0.25 in 3D."""
 
@@ -145,6 +149,7 @@ def test_a_scene_is_the_system_of_the_model_permuted(captured, name):
         "intf_flow": sum(g.num_cells for g in interfaces),
         "mass": sum(g.num_cells for g in subdomains),
     }
+    cells |= {"intf_energy": cells["intf_flow"], "energy": cells["mass"]}
     for field, size in scene.sizes.items():
         assert size == cells[field] * scene.block_size(field), field
         assert scene.cell_centers[field].shape == (cells[field], 3)
@@ -329,32 +334,18 @@ def test_systems_that_are_none_of_ours(captured):
     with pytest.raises(LayoutError, match="contact: expected 12 values, found nothing"):
         adapter.to_porepy({})
     missing = without_equations(model.equation_system, ["tangential_fracture_deformation_equation"])
-    with missing, pytest.raises(LayoutError, match="contact: the model has only some of the equations"):
+    with (
+        missing,
+        pytest.raises(
+            LayoutError, match="unknowns contact_traction and the equations normal_fracture_deformation_equation"
+        ),
+    ):
         Adapter(model)
 
 
-def test_temperature_is_not_supported(pp, tmp_path, monkeypatch):
-    """As early as it can be known: by a model that solves by petsc_fs, at its construction."""
+def test_unknowns_and_equations_that_do_not_pair_up_are_told_before_anything_is_discretised(pp, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # gmsh writes there
     from petsc_fs.porepy import Adapter, FieldSplitSolver
-
-    model = pp.thermoporomechanics.Thermoporomechanics({"times_to_export": []})
-    with pytest.raises(SceneError, match="prepare_simulation"):
-        Adapter(model)
-    model.prepare_simulation()
-    with pytest.raises(LayoutError, match=r"unknowns temperature and equations energy_balance.*not supported"):
-        Adapter(model)
-
-    class Thermal(FieldSplitSolver, pp.thermoporomechanics.Thermoporomechanics):
-        pass
-
-    with pytest.raises(LayoutError, match="Thermal has the unknown temperature, which is not supported"):
-        Thermal({})
-
-
-def test_other_equations_are_refused_before_they_are_discretised(pp, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # gmsh writes there
-    from petsc_fs.porepy import FieldSplitSolver
 
     class Tracer(FieldSplitSolver, pp.SinglePhaseFlow):
         def create_variables(self):
@@ -370,9 +361,24 @@ def test_other_equations_are_refused_before_they_are_discretised(pp, tmp_path, m
             self.equation_system.set_variable_values(zero, ["tracer"], time_step_index=0, iterate_index=0)
 
     model = Tracer({"times_to_export": []})
-    with pytest.raises(LayoutError, match="the model has unknowns tracer, which are not supported"):
+    with pytest.raises(SceneError, match="prepare_simulation"):
+        Adapter(model)
+    with pytest.raises(LayoutError, match="left are the unknowns tracer and the equations none"):
         model.prepare_simulation()
     assert not any(m for _, d in model.mdg.subdomains(return_data=True) for m in d[pp.DISCRETIZATION_MATRICES].values())
+
+
+def test_fluxes_of_energy_are_fourier_before_enthalpy(captured):
+    """That of Fourier is by temperature alone, and that of enthalpy by what the water carries."""
+    _, _, scene, *_ = captured("cold2", "1:2")
+    by_flow, by_heat = (np.abs(blocks_of(scene, "intf_energy", f)).sum(axis=(0, 1, 3)) for f in ("intf_flow", "energy"))
+    assert by_flow[0] == 0 < by_flow[1]
+    assert (by_heat > 0).all()
+    own = blocks_of(scene, "intf_energy", "intf_energy")
+    cells = np.arange(len(own))
+    assert_allclose(own[cells, cells], np.eye(2)[None].repeat(len(own), 0), atol=1e-12)
+    fracture = scene.cell_dimension == 1
+    assert_array_equal(scene.cell_centers["energy"][fracture], scene.cell_centers["contact"])
 
 
 # Models
@@ -505,7 +511,7 @@ def read_collected(path, name):
         return read_group(file[name])
 
 
-@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("name", BUNDLED)
 def test_bundled_scenes(name):
     """They have what they are there for: all contact states, and an accurate reference."""
     pytest.importorskip("scipy")
