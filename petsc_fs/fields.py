@@ -20,7 +20,7 @@ class Field:
     Attributes:
         name: HDF5 group, name in the DM, option prefix and row of the report.
         index: number of the field in the paper, J_ij (Zabegaev et al., arXiv:2501.07441); beyond it they count on.
-        components: unknowns per cell; 0 for one per coordinate direction.
+        vector: whether there is one unknown per coordinate direction and cell, or one per cell.
         unknown: what the columns are.
         equation: what the rows are.
         unit: SI unit of the unknown.
@@ -28,26 +28,27 @@ class Field:
 
     name: str
     index: int
-    components: int
+    vector: bool
     unknown: str
     equation: str
     unit: str
 
     def block_size(self, dimension: int) -> int:
         """Unknowns per cell in a domain of this dimension."""
-        return self.components or dimension
+        return dimension if self.vector else 1
 
 
 FIELDS = (
-    Field("contact", 1, 0, "contact traction per fracture cell", "contact conditions C_n, C_tau", "1"),
-    Field("intf_force", 2, 0, "interface displacement", "interface force balance", "m"),
-    Field("momentum", 3, 0, "displacement of the rock", "momentum balance", "m"),
-    Field("intf_flow", 4, 1, "interface Darcy flux", "interface Darcy law", "m^3/s"),
-    Field("intf_energy", 7, 2, "interface Fourier and enthalpy flux", "interface Fourier law, advection", "W"),
-    Field("well_flow", 8, 1, "flux between well and fracture", "Peaceman's well model", "m^3/s"),
-    Field("well_energy", 9, 1, "enthalpy flux between well and fracture", "advection", "W"),
-    Field("mass", 5, 1, "pressure in rock, fractures and intersections", "fluid mass balance", "Pa"),
-    Field("energy", 6, 1, "temperature in rock, fractures and intersections", "energy balance", "K"),
+    Field("contact", 1, True, "contact traction per fracture cell", "contact conditions C_n, C_tau", "1"),
+    Field("intf_force", 2, True, "interface displacement", "interface force balance", "m"),
+    Field("momentum", 3, True, "displacement of the rock", "momentum balance", "m"),
+    Field("intf_flow", 4, False, "interface Darcy flux", "interface Darcy law", "m^3/s"),
+    Field("intf_fourier", 7, False, "interface Fourier flux", "interface Fourier law", "W"),
+    Field("intf_enthalpy", 8, False, "interface enthalpy flux", "enthalpy that the fluid carries", "W"),
+    Field("well_flow", 9, False, "flux between well and fracture", "Peaceman's well model", "m^3/s"),
+    Field("well_enthalpy", 10, False, "enthalpy flux of a well", "enthalpy that the fluid carries", "W"),
+    Field("mass", 5, False, "pressure in rock, fractures and intersections", "fluid mass balance", "Pa"),
+    Field("energy", 6, False, "temperature in rock, fractures and intersections", "energy balance", "K"),
 )
 """In the order of elimination; `in_order` puts others behind them."""
 FIELD_NAMES = tuple(field.name for field in FIELDS)
@@ -63,7 +64,7 @@ class _Table(dict[str, Field]):
         if name not in self:
             raise KeyError(name)
         what = name.partition("_")[2]
-        return Field(name, len(FIELDS) + 1, 1, what, f"equation of {what}", "")
+        return Field(name, len(FIELDS) + 1, False, what, f"equation of {what}", "")
 
 
 OTHER = r"other_\w+"
@@ -75,7 +76,7 @@ ALIASES: dict[str, str] = {}
 
 MECHANICS = ("intf_force", "momentum")
 """Fields that one multigrid treats together, under the name "mechanics"."""
-FLUXES = ("intf_flow", "intf_energy", "well_flow", "well_energy")
+FLUXES = ("intf_flow", "intf_fourier", "intf_enthalpy", "well_flow", "well_enthalpy")
 """Fields of fluxes between subdomains, which are eliminated together, under the name "fluxes"."""
 POTENTIALS = ("mass", "energy")
 """Pressure and temperature, under the name "potentials" where both are there."""

@@ -20,7 +20,7 @@ NULL = 1e-12
 """Part of |A| |v| in an equation that rounding explains."""
 GROUPS = (
     (("intf_flow", "well_flow", "mass"), ("mass",)),
-    (("intf_energy", "well_energy", "energy"), ("energy",)),
+    (("intf_fourier", "intf_enthalpy", "well_enthalpy", "energy"), ("energy",)),
     (MECHANICS, MECHANICS),
 )
 """Fields whose blocks make up the parts, and those of them that a null vector is in."""

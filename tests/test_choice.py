@@ -27,7 +27,7 @@ from petsc_fs.tools import stress_cases
 
 BUNDLED = ("biot", "cold2", "contact", "flow", "model1", "model2", "model3")
 WARM = ("contact", "intf_force", "momentum", "intf_flow", "mass")
-HOT = ("contact", "intf_force", "momentum", "intf_flow", "intf_energy", "mass", "energy")
+HOT = ("contact", "intf_force", "momentum", "intf_flow", "intf_fourier", "intf_enthalpy", "mass", "energy")
 
 Levels = dict[str, str]
 """Type of each PC by its prefix."""
@@ -136,9 +136,9 @@ SUBSETS: dict[tuple[str, ...], Levels] = {
     | contact_levels("qr_", coupled_levels("qr_fieldsplit_1_", "mechanics", intf_flow=False)),
     WARM: FULL,
     ("mass", "energy"): joined_levels("", fluxes="", heat=True),
-    ("intf_flow", "intf_energy", "mass", "energy"): joined_levels("", fluxes="fluxes", heat=True),
+    ("intf_flow", "intf_fourier", "intf_enthalpy", "mass", "energy"): joined_levels("", fluxes="fluxes", heat=True),
     ("intf_flow", "mass", "energy"): joined_levels("", fluxes="intf_flow", heat=True),
-    ("intf_flow", "intf_energy", "mass"): joined_levels("", fluxes="fluxes", heat=False),
+    ("intf_flow", "intf_fourier", "intf_enthalpy", "mass"): joined_levels("", fluxes="fluxes", heat=False),
     ("momentum", "mass", "energy"): {
         "": "fieldsplit",
         **displacements("fieldsplit_momentum_"),

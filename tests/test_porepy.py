@@ -26,7 +26,7 @@ from petsc_fs.scene import contact_state_counts
 
 pytestmark = pytest.mark.porepy
 
-HOT = ("contact", "intf_force", "momentum", "intf_flow", "intf_energy", "mass", "energy")
+HOT = ("contact", "intf_force", "momentum", "intf_flow", "intf_fourier", "intf_enthalpy", "mass", "energy")
 ALL = ("contact", "intf_force", "momentum", "intf_flow", "mass")
 FIELDS = {
     "model1": ALL,
@@ -149,7 +149,7 @@ def test_a_scene_is_the_system_of_the_model_permuted(captured, name):
         "intf_flow": sum(g.num_cells for g in interfaces),
         "mass": sum(g.num_cells for g in subdomains),
     }
-    cells |= {"intf_energy": cells["intf_flow"], "energy": cells["mass"]}
+    cells |= dict.fromkeys(("intf_fourier", "intf_enthalpy"), cells["intf_flow"]) | {"energy": cells["mass"]}
     for field, size in scene.sizes.items():
         assert size == cells[field] * scene.block_size(field), field
         assert scene.cell_centers[field].shape == (cells[field], 3)
@@ -368,17 +368,15 @@ def test_unknowns_and_equations_that_do_not_pair_up_are_told_before_anything_is_
     assert not any(m for _, d in model.mdg.subdomains(return_data=True) for m in d[pp.DISCRETIZATION_MATRICES].values())
 
 
-def test_fluxes_of_energy_are_fourier_before_enthalpy(captured):
-    """That of Fourier is by temperature alone, and that of enthalpy by what the water carries."""
-    _, _, scene, *_ = captured("cold2", "1:2")
-    by_flow, by_heat = (np.abs(blocks_of(scene, "intf_energy", f)).sum(axis=(0, 1, 3)) for f in ("intf_flow", "energy"))
-    assert by_flow[0] == 0 < by_flow[1]
-    assert (by_heat > 0).all()
-    own = blocks_of(scene, "intf_energy", "intf_energy")
-    cells = np.arange(len(own))
-    assert_allclose(own[cells, cells], np.eye(2)[None].repeat(len(own), 0), atol=1e-12)
-    fracture = scene.cell_dimension == 1
-    assert_array_equal(scene.cell_centers["energy"][fracture], scene.cell_centers["contact"])
+def test_temperatures_are_where_pressures_are(captured):
+    """So are fluxes; and what flows carries enthalpy, which Fourier's law does not notice."""
+    scene = captured("cold2", "1:2")[2]
+    for centers in (scene.cell_centers, scene.cell_volumes):
+        assert_array_equal(centers["energy"], centers["mass"])
+        for flux in ("intf_fourier", "intf_enthalpy"):
+            assert_array_equal(centers[flux], centers["intf_flow"])
+    assert ("intf_enthalpy", "intf_flow") in scene.blocks
+    assert ("intf_fourier", "intf_flow") not in scene.blocks
 
 
 # Models

@@ -75,19 +75,19 @@ def mixed(*bases):
 IN_2D = (Warm, SquareDomainOrthogonalFractures)
 WELL = {"fracture_indices": [2], "well_flux": -1e-2, "well_enthalpy": 1.0}
 MODELS = {
-    "heat": (mixed(*IN_2D, pp.MassAndEnergyBalance), TWO_FRACTURES, "intf_flow intf_energy mass energy"),
+    "heat": (mixed(*IN_2D, pp.MassAndEnergyBalance), TWO_FRACTURES, "intf_flow intf_fourier intf_enthalpy mass energy"),
     "heat_without_fractures": (mixed(*IN_2D, pp.MassAndEnergyBalance), {"fracture_indices": []}, "mass energy"),
     "rock": (mixed(*IN_2D, pp.Thermoporomechanics), {"fracture_indices": []}, "momentum mass energy"),
     "fractured_rock": (
         mixed(*IN_2D, pp.Thermoporomechanics),
         TWO_FRACTURES,
-        "contact intf_force momentum intf_flow intf_energy mass energy",
+        "contact intf_force momentum intf_flow intf_fourier intf_enthalpy mass energy",
     ),
     "well": (mixed(Wells, pp.SinglePhaseFlow), WELL, "intf_flow well_flow mass"),
     "warm_well": (
         mixed(Wells, pp.MassAndEnergyBalance),
         WELL,
-        "intf_flow intf_energy well_flow well_energy mass energy",
+        "intf_flow intf_fourier intf_enthalpy well_flow well_enthalpy mass energy",
     ),
     "tracer": (tracer, TWO_FRACTURES, "intf_flow mass other_z_tracer"),
     "damage": (damage, None, "contact other_damage_history"),

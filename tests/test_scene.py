@@ -414,7 +414,7 @@ INVALID = {
     "no_field": (lambda: Scene(dimension=2, sizes={}, blocks={}, rhs={}), "the scene has no field"),
     "unknown_field": (
         lambda: Scene(dimension=2, sizes={"heat": 2}, blocks={}, rhs={}),
-        "unknown field 'heat'; fields are contact, intf_force, momentum, intf_flow, intf_energy, well_flow, ",
+        "unknown field 'heat'; fields are contact, intf_force, momentum, intf_flow, intf_fourier, ",
     ),
     "no_rhs": (lambda: replace(PLAIN, rhs={}), "contact: rhs is missing"),
     "rhs_length": (

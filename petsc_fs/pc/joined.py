@@ -31,8 +31,9 @@ class Joined(WrapperPC):
     PC has the matrix of it.
 
     Options, with the prefix of this PC:
-        -joined_groups <fluxes=intf_flow,intf_energy,well_flow,well_energy:potentials=mass,energy>: names of groups and
-            of the fields in each. A group of which one field alone is there has its name; fields in none come last.
+        -joined_groups <fluxes=intf_flow,intf_fourier,intf_enthalpy,well_flow,well_enthalpy:potentials=mass,energy>:
+            names of groups and of the fields in each. A group of which one field alone is there has its name; fields
+            in none come last.
         -joined_*: of the inner PC, whose fields are the groups.
     """
 

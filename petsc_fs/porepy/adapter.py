@@ -30,36 +30,34 @@ Indices = NDArray[np.int64]
 
 STICKING, SLIDING, OPEN = range(3)
 
-ALL = slice(None)
-
 VARIABLES = {
-    "contact_traction_variable": ("contact", ALL),
-    "interface_displacement_variable": ("intf_force", ALL),
-    "displacement_variable": ("momentum", ALL),
-    "interface_darcy_flux_variable": ("intf_flow", ALL),
-    "interface_fourier_flux_variable": ("intf_energy", slice(0, 1)),
-    "interface_enthalpy_flux_variable": ("intf_energy", slice(1, 2)),
-    "well_flux_variable": ("well_flow", ALL),
-    "well_enthalpy_flux_variable": ("well_energy", ALL),
-    "pressure_variable": ("mass", ALL),
-    "enthalpy_variable": ("energy", ALL),
-    "temperature_variable": ("energy", ALL),
+    "contact_traction_variable": "contact",
+    "interface_displacement_variable": "intf_force",
+    "displacement_variable": "momentum",
+    "interface_darcy_flux_variable": "intf_flow",
+    "interface_fourier_flux_variable": "intf_fourier",
+    "interface_enthalpy_flux_variable": "intf_enthalpy",
+    "well_flux_variable": "well_flow",
+    "well_enthalpy_flux_variable": "well_enthalpy",
+    "pressure_variable": "mass",
+    "enthalpy_variable": "energy",
+    "temperature_variable": "energy",
 }
-"""Attribute in which a PorePy model keeps the name of an unknown, to the field and the components of a cell that it is;
-of two for the same components the first one that the model has."""
+"""Attribute in which a PorePy model keeps the name of an unknown, to the field of the unknown; of two for the same
+field the first one that the model has."""
 
 EQUATIONS = {
     "normal_fracture_deformation_equation": ("contact", slice(0, 1)),
     "tangential_fracture_deformation_equation": ("contact", slice(1, None)),
-    "interface_force_balance_equation": ("intf_force", ALL),
-    "momentum_balance_equation": ("momentum", ALL),
-    "interface_darcy_flux_equation": ("intf_flow", ALL),
-    "interface_fourier_flux_equation": ("intf_energy", slice(0, 1)),
-    "interface_enthalpy_flux_equation": ("intf_energy", slice(1, 2)),
-    "well_flux_equation": ("well_flow", ALL),
-    "well_enthalpy_flux_equation": ("well_energy", ALL),
-    "mass_balance_equation": ("mass", ALL),
-    "energy_balance_equation": ("energy", ALL),
+    "interface_force_balance_equation": ("intf_force", slice(None)),
+    "momentum_balance_equation": ("momentum", slice(None)),
+    "interface_darcy_flux_equation": ("intf_flow", slice(None)),
+    "interface_fourier_flux_equation": ("intf_fourier", slice(None)),
+    "interface_enthalpy_flux_equation": ("intf_enthalpy", slice(None)),
+    "well_flux_equation": ("well_flow", slice(None)),
+    "well_enthalpy_flux_equation": ("well_enthalpy", slice(None)),
+    "mass_balance_equation": ("mass", slice(None)),
+    "energy_balance_equation": ("energy", slice(None)),
 }
 """Name of an equation in PorePy, to its field and the components of a cell that it provides."""
 
@@ -214,36 +212,28 @@ class Adapter:
             parts = equations[equation]
             rows[equation] = {g: offset + local for g, local in parts.items() if local.size}
             offset += sum(local.size for local in parts.values())
-        unknowns: dict[str, tuple[str, slice]] = {}
-        for attribute, place in VARIABLES.items():
-            if (name := getattr(self.model, attribute, None)) in columns and place not in unknowns.values():
-                unknowns[name] = place
         found: dict[str, tuple[Places, Places]] = {}
-        for field in dict.fromkeys(field for field, _ in unknowns.values()):
-            sides = [
-                self._joined(field, {n: parts for n, parts in side.items() if table.get(n, ("",))[0] == field}, table)
-                for side, table in ((rows, EQUATIONS), (columns, unknowns))
-            ]
-            if sides[0] is not None and sides[1] is not None and sides[0].keys() == sides[1].keys():
-                found[field] = sides[0], sides[1]
-                for side, table in ((rows, EQUATIONS), (columns, unknowns)):
-                    for name in [n for n in side if table.get(n, ("",))[0] == field]:
-                        del side[name]
+        for attribute, field in VARIABLES.items():
+            name = getattr(self.model, attribute, None)
+            if name not in columns or field in found:
+                continue
+            own = {e: part for e, (f, part) in EQUATIONS.items() if f == field and e in rows}
+            bs, places = self._block_size(field), columns[name]
+            here = {g: np.full((g.num_cells, bs), -1, dtype=np.int64) for g in places}
+            fits = all(dofs.size == here[g].size for g, dofs in places.items())
+            for (grid, numbers), part in ((item, part) for e, part in own.items() for item in rows[e].items()):
+                if grid not in here or here[grid][:, part].size != numbers.size:
+                    fits = False
+                else:
+                    here[grid][:, part] = numbers.reshape(grid.num_cells, -1)
+            if fits and all((numbers >= 0).all() for numbers in here.values()):
+                found[field] = here, {g: dofs.reshape(-1, bs) for g, dofs in places.items()}
+                del columns[name]
+                for equation in own:
+                    del rows[equation]
         if "contact" in found:
             found["contact"] = found["contact"][0], {g: np.roll(c, 1, axis=1) for g, c in found["contact"][1].items()}
         return found | _others(rows, columns)
-
-    def _joined(self, field: str, parts: Mapping[str, Places], table: Mapping[str, tuple[str, slice]]) -> Places | None:
-        """Per grid what several unknowns or equations have, component by component; None if that is not all of it."""
-        found: Places = {}
-        for name, places in parts.items():
-            for grid, numbers in places.items():
-                here = found.setdefault(grid, np.full((grid.num_cells, self._block_size(field)), -1, dtype=np.int64))
-                own = here[:, table[name][1]]
-                if own.size != numbers.size:
-                    return None
-                here[:, table[name][1]] = numbers.reshape(own.shape)
-        return None if any((numbers < 0).any() for numbers in found.values()) else found
 
     def _block_size(self, name: str) -> int:
         return FIELD[name].block_size(self.model.nd)

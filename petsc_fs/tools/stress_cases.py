@@ -128,7 +128,8 @@ def unknowns_in_units(scene: Scene, *, kg: float = 1.0, m: float = 1.0, s: float
 
 def _fluxes(mass: float, length: float, time: float) -> dict[str, float]:
     flow, power = length**3 / time, mass * length**2 / time**3
-    return {"intf_flow": flow, "well_flow": flow, "intf_energy": power, "well_energy": power}
+    heat = dict.fromkeys(("intf_fourier", "intf_enthalpy", "well_enthalpy"), power)
+    return {"intf_flow": flow, "well_flow": flow} | heat
 
 
 def in_units(scene: Scene, *, kg: float = 1.0, m: float = 1.0, s: float = 1.0) -> Scene:
