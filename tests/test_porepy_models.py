@@ -111,7 +111,7 @@ def run(cls, parameters, mixin):
     times = np.arange(3.0) * (0.1 if "exact_solution" not in parameters else 1.0)
     own = {"times_to_export": [], "time_manager": pp.TimeManager(times, times[1], constant_dt=True)}
     model = Watched(parameters | own)
-    newton = {"nl_convergence_tol": np.inf, "nl_convergence_tol_res": 1e-10, "max_iterations": 30}
+    newton = {"nl_convergence_tol": np.inf, "nl_convergence_tol_res": 1e-12, "max_iterations": 30}
     pp.run_time_dependent_model(model, {"progressbars": False} | newton)
     return model, states
 

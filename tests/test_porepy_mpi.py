@@ -77,8 +77,8 @@ SAME = {
     "model3": (0.25, 6, 1e-7),
     "biot": (0.5, 6, 1e-10),
     "flow": (0.5, 6, 1e-10),
-    "cold2": (1, 4, 1e-10),
-    "cold3": (0.25, 2, 1e-10),
+    "cold2": (1, 3, 1e-10),
+    "cold3": (0.25, 1, 1e-10),
 }
 """Refinement, time steps, nonlinear tolerance. The models have six time steps. The tolerances determine the states:
 PorePy takes whatever is below it, and the last four time steps of model 2 begin so close to 1e-10 that the states of
