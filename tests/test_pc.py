@@ -25,6 +25,7 @@ from sample import full_scene
 
 from petsc_fs import nest
 from petsc_fs.errors import LayoutError, SceneError, UsageError
+from petsc_fs.fields import FLOW, POTENTIALS
 from petsc_fs.pc import contact_transform
 from petsc_fs.scene import Scene
 from petsc_fs.solver import Solver
@@ -327,13 +328,17 @@ CONTRACT = {
     "assembled-block": ("Assembled", "mechanics", "block", under("assembled_", LU)),
     "sweep": ("ComponentSweep", "mechanics", "nest", under("component_", LU)),
     "sweep-of-a-block": ("ComponentSweep", "mechanics", "block", under("component_", LU)),
+    "joined": ("Joined", "heat", "nest", upper("joined_", "fluxes", "potentials", "selfp", "jacobi")),
+    "joined-to-one": ("Joined", "potentials", "nest", under("joined_", LU)),
 }
 BLOCK = {"flow": "mass", "mechanics": "momentum"}
 
 
 def contract_scene(part: str) -> Scene:
     """Contact mechanics, or a part of a coupled scene: the flow has a fixed-stress diagonal other than zero."""
-    chosen = {"flow": ("intf_flow", "mass"), "mechanics": MECHANICS}
+    chosen = {"flow": ("intf_flow", "mass"), "mechanics": MECHANICS, "heat": FLOW, "potentials": POTENTIALS}
+    if part in ("heat", "potentials"):
+        return load("cold2").only(chosen[part])
     return load("contact") if part == "contact" else load("model2").only(chosen[part])
 
 
