@@ -84,7 +84,7 @@ def test_components_are_fields_that_may_overlap(clean):
 
 @pytest.mark.parametrize("groups", ["fluxes", "a=mass:b=mass,energy", "=mass"])
 def test_groups_that_cannot_be_read(clean, groups):
-    with pytest.raises(Exception, match=".*") as caught:
+    with pytest.raises(Exception, match=r".*") as caught:
         python_pc(system_of(load("cold2").only(POTENTIALS)).J, "Joined", joined_groups=groups)
     assert "-c_joined_groups: expected NAME=FIELD,FIELD:NAME=FIELD,... of other fields each" in said(caught.value)
 
@@ -92,6 +92,6 @@ def test_groups_that_cannot_be_read(clean, groups):
 def test_one_matrix_has_no_fields_to_join(clean):
     scene = load("flow").only(["mass"])
     assert block_of(scene, "mass", "mass").any()
-    with pytest.raises(Exception, match=".*") as caught:
+    with pytest.raises(Exception, match=r".*") as caught:
         python_pc(system_of(scene).blocks["mass", "mass"], "Joined")
     assert "Joined needs a MatNest with a block per field" in said(caught.value)

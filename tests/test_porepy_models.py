@@ -45,9 +45,7 @@ class Wells(well_models.OneVerticalWell, CubeDomainOrthogonalFractures, well_mod
 
 
 def tracer():
-    from porepy.examples.tracer_flow import TracerFlowModel
-
-    return TracerFlowModel
+    return pytest.importorskip("porepy.examples.tracer_flow", reason="PorePy 1.10 has none").TracerFlowModel
 
 
 def damage():
@@ -57,8 +55,8 @@ def damage():
 
 
 def damage_parameters():
+    example = pytest.importorskip("porepy.examples.fracture_damage", reason="PorePy 1.10 has none")
     from porepy.compositional.materials import FractureDamageSolidConstants
-    from porepy.examples import fracture_damage as example
 
     constants = example.solid_params | {"initial_friction_damage": 1.1, "initial_dilation_damage": 1.1}
     return example.model_params | {
