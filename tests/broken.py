@@ -155,7 +155,9 @@ edits = st.tuples(
 
 def cells_of(known: dict[str, int | None]) -> dict[str, int]:
     """Numbers of cells of the fields that a scene has, some of them 0 or 1."""
-    found = {f: CELLS[f] if n is None else n for f, n in known.items()}
+    found = {
+        f: CELLS.get(f, CELLS["mass" if f == "energy" else "intf_flow"]) if n is None else n for f, n in known.items()
+    }
     return found or {"mass": 3}
 
 
@@ -176,7 +178,7 @@ files = st.builds(
     whole,
     st.integers(0, 999),
     st.just(()),
-    st.sampled_from([f.path.name for f in options.shipped() if f.fits(FIELD_NAMES)]),
+    st.sampled_from([f.path.name for f in options.shipped() if f.fits(CELLS)]),
     st.lists(edits, min_size=1, max_size=3).map(tuple),
 )
 inputs = st.integers(0, 5).flatmap(lambda k: scenes if k else files)
