@@ -130,7 +130,8 @@ def field_dm(A: PETSc.Mat) -> PETSc.DMShell:
 
 
 COMPONENTS = "petsc_fs_components"
-"""Names of the unknowns of a cell, one for each."""
+"""Name, and sizes on this rank and on all, of each scalar field that a matrix is made of: the unknowns of a cell next
+to each other if the block size is their number, else one field after the other."""
 
 
 class _Field:
@@ -142,7 +143,7 @@ class _Field:
         total: rows on all ranks.
         block_size: of the block.
         members: the fields of a block that is a MatNest, or its components.
-        interleaved: whether the members are components.
+        interleaved: whether the members are components of a cell.
     """
 
     def __init__(self, name: str, sizes: tuple[int, int], block_size: int, members: list[_Field]) -> None:
@@ -156,8 +157,8 @@ class _Field:
         members = [cls.of(block.getNestSubMatrix(i, i)) for i in range(count)]
         field = cls(block.getName(), block.getSizes()[0], block.getBlockSize(), members)
         if components := block.getAttr(COMPONENTS):
-            sizes = field.local // len(components), field.total // len(components)
-            field.members, field.interleaved = [cls(name, sizes, 1, []) for name in components], True
+            field.members = [cls(name, sizes, 1, []) for name, sizes in components]
+            field.interleaved = field.block_size == len(components)
         return field
 
 

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from common import comm, load, times, unequal
+from common import comm, csr, load, times, unequal
 from mpi4py import MPI
 from petsc4py import PETSc
 from programs import ENVIRONMENT, MPIEXEC
@@ -231,6 +231,35 @@ def test_scene_without_some_fields_has_exactly_the_levels_of_the_others(solve, n
     solved.assert_smallest(SUBSETS[fields])
     if (name, fields) != CLOSED:
         solved.assert_solved()
+
+
+def with_tracers(scene: Scene, names: tuple[str, ...]) -> Scene:
+    """Further fields, each carried from a cell to the next of the pressures, and by what presses."""
+    n = scene.sizes["mass"]
+    along = csr(2.0 * np.eye(n) - np.eye(n, k=-1))
+    blocks = dict(scene.blocks)
+    for name in names:
+        blocks |= {(name, name): along, (name, "mass"): csr(np.eye(n))}
+    sizes, centers = scene.sizes | dict.fromkeys(names, n), dict.fromkeys(names, scene.cell_centers["mass"])
+    reference = scene.reference | {name: np.ones(n) for name in names}
+    return smooth(
+        replace(scene, sizes=sizes, blocks=blocks, cell_centers=scene.cell_centers | centers, reference=reference)
+    )
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("names", [("other_salt",), ("other_dye", "other_salt")])
+def test_fields_without_a_place_come_last(solve, names):
+    """By ILU, which is told."""
+    solved = solve(with_tracers(load("flow"), names))
+    last = f"fieldsplit_{names[0]}_" if len(names) == 1 else "fieldsplit_1_"
+    leaf = {last: "asm"} if len(names) == 1 else {last: "python", f"{last}assembled_": "asm"}
+    assert solved.levels == {"": "fieldsplit"} | flow_levels("fieldsplit_0_") | leaf
+    assert solved.unused == []
+    solved.assert_solved()
+    assert all(solved.result.error_by_field[name] < 1e-6 for name in names)
+    line = f"no file has a place for {', '.join(names)}: solved after all others, by ILU"
+    assert solved.choice.left_out[-1] == line
 
 
 @pytest.mark.mpi

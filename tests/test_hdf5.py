@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
-from sample import SCENES, assert_same, full_scene
+from sample import CELLS, SCENES, assert_same, full_scene
 
 from petsc_fs.errors import LayoutError, SceneError, UsageError
 from petsc_fs.io import hdf5
@@ -47,6 +47,13 @@ def test_a_scene_with_next_to_nothing_comes_back(tmp_path):
     back = hdf5.read(hdf5.write(scene, tmp_path / "s.h5"))
     assert_same(scene, back)
     assert (back.material, back.contact_state, back.reference, back.metadata.model) == (None, None, {}, "")
+
+
+def test_any_field_comes_back(tmp_path):
+    cells = CELLS | {"intf_fourier": 3, "well_flow": 1, "energy": 6, "other_z_tracer": 6, "other_damage": 2}
+    scene = full_scene(2, cells)
+    assert scene.fields[-2:] == ("other_damage", "other_z_tracer")
+    assert_same(scene, hdf5.read(hdf5.write(scene, tmp_path / "s.h5")))
 
 
 def test_a_field_without_cells_comes_back(tmp_path):

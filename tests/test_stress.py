@@ -8,7 +8,7 @@ import pytest
 from broken import BAD, Broken, Damage, attempt, inputs
 from hypothesis import example, given, settings
 from mpi4py import MPI
-from sample import CELLS, full_scene
+from sample import CELLS, SCENES, full_scene
 
 from petsc_fs import options
 from petsc_fs.cli import main as cli
@@ -64,9 +64,10 @@ def test_exported_scenes_fit_together(name):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("units", UNIT_SYSTEMS, ids=str)
-def test_units_change_neither_answer_nor_accuracy(units):
+@pytest.mark.parametrize("name", ["base", "cold2"])
+def test_units_change_neither_answer_nor_accuracy(name, units):
     """The same answer, field by field, in four unit systems: what is left is what the tolerance leaves."""
-    scene = load("base")
+    scene = load(name) if name == "base" else hdf5.read(SCENES / f"{name}.h5")
     exact, known = solve(scene, ksp_rtol="1e-13", ksp_atol="0")
     changed = in_units(scene, **units)
     assert changed.metadata.units == {"kg": 1.0, "m": 1.0, "s": 1.0} | units
@@ -76,9 +77,10 @@ def test_units_change_neither_answer_nor_accuracy(units):
         assert np.linalg.norm(solution[f] / factor - known[f]) < 1e-7 * np.linalg.norm(known[f]), f
 
 
-def test_units_are_those_of_the_equations():
+@pytest.mark.parametrize("name", ["one_cell", "cold2"])
+def test_units_are_those_of_the_equations(name):
     """The direct solution in other units is the same one, so that equations and unknowns go together."""
-    scene = load("one_cell")
+    scene = load(name) if name == "one_cell" else hdf5.read(SCENES / f"{name}.h5")
     units = {"kg": 1e10, "m": 1e-3, "s": 3600.0}
     here = reference.solve(scene, "direct").solution
     there = reference.solve(in_units(scene, **units), "direct").solution

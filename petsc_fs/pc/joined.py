@@ -65,8 +65,8 @@ class Joined(WrapperPC):
         }
         for name, members in groups.items():
             made[name, name].setName(name)
-            if places[name][1] == len(members) > 1:
-                made[name, name].setAttr(nest.COMPONENTS, members)
+            if places[name][1] in (1, len(members)) and len(members) > 1:
+                made[name, name].setAttr(nest.COMPONENTS, [(f, blocks[f, f].getSizes()[0]) for f in members])
         if len(groups) == 1:
             return made.popitem()[1]
         joined = nest.nest_of([*groups], made, pc.comm)
