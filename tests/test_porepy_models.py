@@ -92,7 +92,7 @@ MODELS = {
 }
 
 
-def run(cls, parameters, mixin):
+def run(cls, parameters, mixin, tolerance):
     """The model, and its state and number of Newton steps at the end of each time step."""
     states = []
 
@@ -109,7 +109,7 @@ def run(cls, parameters, mixin):
     times = np.arange(3.0) * (0.1 if "exact_solution" not in parameters else 1.0)
     own = {"times_to_export": [], "time_manager": pp.TimeManager(times, times[1], constant_dt=True)}
     model = Watched(parameters | own)
-    newton = {"nl_convergence_tol": np.inf, "nl_convergence_tol_res": 1e-12, "max_iterations": 30}
+    newton = {"nl_convergence_tol": np.inf, "nl_convergence_tol_res": tolerance, "max_iterations": 30}
     pp.run_time_dependent_model(model, {"progressbars": False} | newton)
     return model, states
 
@@ -124,7 +124,8 @@ def test_states_are_those_of_a_direct_solver(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)  # gmsh writes there
     make, parameters, fields = MODELS[name]
     parameters = damage_parameters() if parameters is None else parameters
-    (ours, found), (_, expected) = (run(make(), dict(parameters), how) for how in (FieldSplitSolver, Direct))
+    tolerance = 1e-12 if "momentum" in fields else 1e-10  # that fixes the state to more digits than are compared
+    (ours, found), (_, expected) = (run(make(), dict(parameters), how, tolerance) for how in (FieldSplitSolver, Direct))
     adapter = Adapter(ours)
     scene = adapter.scene()
     assert scene.fields == tuple(fields.split())

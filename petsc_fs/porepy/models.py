@@ -24,7 +24,18 @@ from numpy.typing import NDArray
 
 from petsc_fs.errors import SolveError, UsageError
 from petsc_fs.porepy import require_porepy
-from petsc_fs.porepy.cases import CASES, CELL, CONTACT_SCALING, MASS_UNIT, SIDE, Case, ModelParameters, Rock, find_case
+from petsc_fs.porepy.cases import (
+    CASES,
+    CELL,
+    CONTACT_SCALING,
+    MASS_UNIT,
+    ROCK,
+    SIDE,
+    Case,
+    ModelParameters,
+    Rock,
+    find_case,
+)
 
 require_porepy()
 
@@ -181,7 +192,7 @@ class FlowLoads(pp.SolutionStrategy):
 
     case: Case
     parameters: ModelParameters
-    rock: Rock
+    rock: Rock = ROCK
 
     def bc_type_fluid_flux(self, sd: Any) -> Any:
         """Pressure, and with it density and mobility, are given on all sides."""
@@ -203,7 +214,7 @@ class ColdInjection(pp.SolutionStrategy):
     """Cold water flows into a fracture; the border keeps the temperature that everything starts with."""
 
     case: Case
-    rock: Rock
+    rock: Rock = ROCK
 
     def bc_type_fourier_flux(self, sd: Any) -> Any:
         """Temperature is given on all sides."""
@@ -288,7 +299,7 @@ class RestrictedMass(pp.constitutive_laws.SpecificStorage):
     """
 
     parameters: ModelParameters
-    rock: Rock
+    rock: Rock = ROCK
 
     def fluid_mass(self, subdomains: list[Any]) -> Any:
         """Mass per cell as an AD operator."""
