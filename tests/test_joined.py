@@ -10,6 +10,7 @@ from test_pc import LU, inner_matrix, python_pc, said, under
 
 from petsc_fs import nest
 from petsc_fs.fields import FLOW, FLUXES, POTENTIALS
+from petsc_fs.pc.joined import GROUPS
 
 pytestmark = pytest.mark.mpi
 
@@ -24,6 +25,11 @@ def order(system, fields):
         found.append(np.column_stack(mine).ravel() if len({*own}) == 1 else np.concatenate(mine))
         start += sum(own)
     return np.concatenate(found)
+
+
+def test_groups_are_those_of_the_table():
+    """Which the PCs do not know."""
+    assert f"fluxes={','.join(FLUXES)}:potentials={','.join(POTENTIALS)}" == GROUPS
 
 
 @pytest.mark.parametrize("groups", ["", "flow=intf_flow,mass:heat=energy,intf_fourier,intf_enthalpy"])

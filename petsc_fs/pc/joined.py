@@ -13,11 +13,11 @@ from petsc4py import PETSc
 
 from petsc_fs import nest
 from petsc_fs.errors import UsageError
-from petsc_fs.fields import FLUXES, POTENTIALS
 from petsc_fs.nest import Blocks
 from petsc_fs.pc.base import WrapperPC, text, told
 
-GROUPS = {"fluxes": FLUXES, "potentials": POTENTIALS}
+GROUPS = "fluxes=intf_flow,intf_fourier,intf_enthalpy,well_flow,well_enthalpy:potentials=mass,energy"
+"""Default of -joined_groups."""
 
 
 class Joined(WrapperPC):
@@ -51,7 +51,7 @@ class Joined(WrapperPC):
         if operator.getType() != "nest":
             raise UsageError("Joined needs a MatNest with a block per field; petsc_fs.nest.split makes one")
         names, blocks = nest.field_names(operator), nest.blocks_of(operator)
-        groups = _groups(text(pc, "joined_groups", ":".join(f"{g}={','.join(f)}" for g, f in GROUPS.items())), names)
+        groups = _groups(text(pc, "joined_groups", GROUPS), names)
         if groups is None:
             raise UsageError(f"-{prefix}joined_groups: expected NAME=FIELD,FIELD:NAME=FIELD,... of other fields each")
         sizes = [blocks[f, f].getSizes()[0][0] for f in names]
