@@ -43,6 +43,7 @@ ITERATIONS = {
 SINCE_3_22 = {
     "contact_poromechanics_gamg": {"model1": 47, "model2": 32, "model3": 50},
     "poromechanics_gamg": {"biot": 22, "undrained": 27},
+    "contact_thermoporomechanics_gamg": {"cold2": 25},
 }
 """What is different with PETSc 3.22 and hypre 2.32."""
 if PETSc.Sys.getVersion() >= (3, 22):
