@@ -334,12 +334,8 @@ def test_systems_that_are_none_of_ours(captured):
     with pytest.raises(LayoutError, match="contact: expected 12 values, found nothing"):
         adapter.to_porepy({})
     missing = without_equations(model.equation_system, ["tangential_fracture_deformation_equation"])
-    with (
-        missing,
-        pytest.raises(
-            LayoutError, match="unknowns contact_traction and the equations normal_fracture_deformation_equation"
-        ),
-    ):
+    left = f"unknowns {model.contact_traction_variable} and the equations normal_fracture_deformation_equation"
+    with missing, pytest.raises(LayoutError, match=left):
         Adapter(model)
 
 
