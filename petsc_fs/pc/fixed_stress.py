@@ -67,7 +67,7 @@ class FixedStress(WrapperPC):
         kinds = ("analytic", "algebraic") if base is not None else ("algebraic", "analytic")
         self.kind = choice(pc, "fs_type", kinds)
         self.damping = PETSc.Options(prefix).getReal("fs_damping", PUBLISHED_DAMPING)
-        self.fractures = PETSc.Options(prefix).getReal("fs_fractures", 0)
+        self.fractures, times = 0.0, PETSc.Options(prefix).getReal("fs_fractures", 0)
         mechanics = (complement, k if whole else None, block.getSizes()[0], prefix)
         if self.kind == "algebraic":
             values = stabilisation(*_mechanics(*mechanics))
@@ -77,8 +77,8 @@ class FixedStress(WrapperPC):
             if complement.getType() == "schurcomplement":
                 algebraic, rock = stabilisation(*_mechanics(*mechanics)), shape != 1.0
                 values = checked(values, rock, algebraic)
-                if self.fractures and ratio is not None:
-                    values = np.where(rock, values, self.fractures * algebraic)
+                if ratio is not None and times:
+                    self.fractures, values = times, np.where(rock, values, times * algebraic)
         else:
             raise UsageError(
                 f"-{prefix}fs_type analytic: the block of {field} has no vector 'fixed_stress_base' (a scene without "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 from petsc_fs.errors import UsageError
@@ -129,6 +129,18 @@ class Case:
     rock: Rock = ROCK
 
 
+COLD = Case(
+    equations="thermoporomechanics",
+    fractures=FOUR_FRACTURES,
+    traction=1.2e7,
+    fracture_permeability="cubic",
+    time_step=HOUR,
+    newton_tolerance=1e-10,
+    injection=0.03,
+    rock=PERMEABLE_ROCK,
+)
+"""Cold water into a network of fractures."""
+
 CASES: dict[str, Case] = {
     "model1": Case(
         fractures=ONE_FRACTURE,
@@ -163,27 +175,8 @@ CASES: dict[str, Case] = {
         time_step=DAY,
         opening=0.5,
     ),
-    "cold2": Case(
-        equations="thermoporomechanics",
-        fractures=FOUR_FRACTURES,
-        traction=1.2e7,
-        fracture_permeability="cubic",
-        time_step=HOUR,
-        newton_tolerance=1e-10,
-        injection=0.03,
-        rock=PERMEABLE_ROCK,
-    ),
-    "cold3": Case(
-        equations="thermoporomechanics",
-        dimension=3,
-        fractures=FOUR_FRACTURES,
-        traction=1.2e7,
-        fracture_permeability="cubic",
-        time_step=HOUR,
-        newton_tolerance=1e-10,
-        injection=20.0,
-        rock=PERMEABLE_ROCK,
-    ),
+    "cold2": COLD,
+    "cold3": replace(COLD, dimension=3, injection=20.0),
 }
 """Name of a model to its set-up."""
 
