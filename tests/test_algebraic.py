@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from common import gathered, load
 from mpi4py import MPI
 from petsc4py import PETSc
 from sample import SCENES, csr, dense
 
 from petsc_fs import nest
+from petsc_fs.fields import POTENTIALS
 from petsc_fs.io import hdf5
 from petsc_fs.options import find_options_file, inserted
 from petsc_fs.pc import FixedStress, fixed_stress
@@ -186,3 +188,47 @@ def test_fractures_may_have_a_multiple_of_it(clean, model2):
     np.testing.assert_allclose(abs(added["3"][~rock]), 3 * algebraic[~rock], rtol=1e-8, atol=limit)
     np.testing.assert_array_equal(added["3"][rock], added["0"][rock])
     assert comm.allreduce(np.count_nonzero(abs(added["3"]) > 10 * abs(added["0"]))) > 10
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("drop", [False, True])
+def test_temperature_may_be_part_of_it(clean, drop):
+    """[[1, t], [e, e t]] times D_55, where temperature moves mechanics t times as much as pressure does."""
+    scene = load("cold2")
+    if drop:  # a block that the diagonal is all of
+        scene = replace(scene, blocks={rc: b for rc, b in scene.blocks.items() if rc != ("mass", "energy")})
+    with inserted({"qr_fieldsplit_1_fieldsplit_1_fs_heat": "energy"}):
+        with inserted(find_options_file("contact_thermoporomechanics.opts")):
+            solver = Solver(scene)
+            solver.set_up()
+    (pc,) = [
+        pc
+        for pc in nest.levels(solver.ksp.getPC())
+        if pc.getType() == "python" and isinstance(pc.getPythonContext(), FixedStress)
+    ]
+    complement, operator = pc.getOperators()
+    names = nest.field_names(operator)
+
+    def whole(M):
+        if M.getType() != "nest":
+            return gathered(M)
+        rows, columns = (range(n) for n in M.getNestSize())
+        return np.block([[whole(M.getNestSubMatrix(i, j)) for j in columns] for i in rows])
+
+    places = {f: (names.index(f), operator.getNestSubMatrix(*2 * [names.index(f)]).getSizes()[0]) for f in POTENTIALS}
+    parts = [fixed_stress._mechanics(complement, *places[f], "") for f in POTENTIALS]
+    (B, C), (B_h, C_h) = ([whole(M) for M in part[1:]] for part in parts)
+    t, e = ((A * H).sum(axis=0) / (A**2).sum(axis=0).clip(1e-300) for A, H in ((B, B_h), (C.T, C_h.T)))
+    assert np.count_nonzero(t) > 100
+    assert np.count_nonzero(e) > 100
+    np.testing.assert_allclose(B * t, B_h, atol=1e-9 * abs(B_h).max())
+    before, after = (nest.blocks_of(M) for M in (operator, pc.getPythonContext().inners[0].getOperators()[1]))
+
+    def added(*rc):
+        start = np.diag(gathered(before[rc])) if rc in before else 0.0
+        return np.diag(gathered(after[rc])) - start
+
+    D = added("mass", "mass")
+    for rc, factor in {("mass", "energy"): t, ("energy", "mass"): e, ("energy", "energy"): e * t}.items():
+        size = abs(gathered(after[rc])).max()
+        np.testing.assert_allclose(added(*rc), factor * D, rtol=1e-6, atol=1e-12 * size)

@@ -36,6 +36,11 @@ class FixedStress(WrapperPC):
         -fs_fractures <0>: where not 0, cells of fractures have this multiple of the algebraic value in place of the
             analytic one, which leaves out that fractures open as their pressure rises. That of cells which open one by
             one is the algebraic one; fractures open as a whole, more easily.
+        -fs_heat <>: name of the field of temperature, for the extended fixed-stress split (Kim, "Unconditionally stable
+            sequential schemes for all-way coupled thermoporomechanics", 2018): where mechanics' columns of temperature
+            are t times those of pressure, and the energy balance's rows e times those of the mass balance, D_55 times
+            [[1, t], [e, e t]] is added, cell by cell, with t and e from the matrix. Without a name the split is
+            isothermal: D_55 alone.
         -fs_drop <0>: entries of the block of pressure less than this share of the diagonal of their row are left out,
             see `petsc_fs.pc.sparser`; 0 keeps all.
         -fs_*: of the inner PC.
@@ -45,6 +50,7 @@ class FixedStress(WrapperPC):
     kind = "analytic"
     damping = PUBLISHED_DAMPING
     fractures = 0.0
+    heat = ""
 
     def build(self, pc: PETSc.PC) -> PETSc.Mat:
         """S^2. Collective.
@@ -68,6 +74,7 @@ class FixedStress(WrapperPC):
         self.kind = choice(pc, "fs_type", kinds)
         self.damping = PETSc.Options(prefix).getReal("fs_damping", PUBLISHED_DAMPING)
         self.fractures, times = 0.0, PETSc.Options(prefix).getReal("fs_fractures", 0)
+        self.heat = text(pc, "fs_heat", "")
         mechanics = (complement, k if whole else None, block.getSizes()[0], prefix)
         if self.kind == "algebraic":
             values = stabilisation(*_mechanics(*mechanics))
@@ -86,25 +93,78 @@ class FixedStress(WrapperPC):
             )
         diagonal = block.getDiagonal()  # whose signs are those of the mass balance
         diagonal.setArray(np.copysign(values, diagonal.getArray()))
-        S = block.duplicate(copy=True)
-        S.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)  # the diagonal may be missing from the pattern
-        S.setDiagonal(diagonal, addv=PETSc.InsertMode.ADD_VALUES)
-        S = sparser(S, PETSc.Options(prefix).getReal("fs_drop", 0))
+        S = sparser(_plus(block, diagonal), PETSc.Options(prefix).getReal("fs_drop", 0))
         S.setName(block.getName())
+        changed = {(k, k): S}
+        if self.heat:
+            if not whole or self.heat not in names:
+                raise UsageError(f"-{prefix}fs_heat {self.heat}: no such field; there are {', '.join(names)}")
+            h = names.index(self.heat)
+            other = (complement, h, operator.getNestSubMatrix(h, h).getSizes()[0], prefix)
+            for place, factor in _extension(_mechanics(*mechanics), _mechanics(*other), k, h).items():
+                factor.pointwiseMult(factor, diagonal)
+                changed[place] = _plus(
+                    operator.getNestSubMatrix(*place) or nest.empty(block.getSizes(), pc.comm), factor
+                )
+                factor.destroy()
+            changed[h, h].setName(self.heat)
         diagonal.destroy()
         if not whole:
             return S
         count = range(len(names))
-        grid = [[S if i == j == k else operator.getNestSubMatrix(i, j) or None for j in count] for i in count]
+        grid = [[changed.get((i, j)) or operator.getNestSubMatrix(i, j) or None for j in count] for i in count]
         nested = PETSc.Mat().createNest(grid, comm=pc.comm)
-        S.destroy()  # the nest holds it
+        for matrix in changed.values():
+            matrix.destroy()  # the nest holds it
         return nested
 
     def describe(self) -> str:
         """The diagonal in one line."""
+        heat = f", extended to {self.heat}" if self.heat else ""
         damping = f", damping exponent {self.damping:g}" if self.kind == "analytic" else ""
         fractures = f", in fractures {self.fractures:g} times the algebraic one" if self.fractures else ""
-        return f"{self.kind} fixed-stress diagonal on the mass block{damping}{fractures}"
+        return f"{self.kind} fixed-stress diagonal on the mass block{damping}{fractures}{heat}"
+
+
+def _plus(A: PETSc.Mat, diagonal: PETSc.Vec) -> PETSc.Mat:
+    """A copy of A with more on the diagonal, which may be missing from its pattern. Collective."""
+    B = A.duplicate(copy=True)
+    B.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
+    B.setDiagonal(diagonal, addv=PETSc.InsertMode.ADD_VALUES)
+    return B
+
+
+def _extension(
+    pressure: tuple[PETSc.Mat, ...], heat: tuple[PETSc.Mat, ...], k: int, h: int
+) -> dict[tuple[int, int], PETSc.Vec]:
+    """t, e and e t of the extended split by their blocks, from `_mechanics` of fields k and h. Collective."""
+    (_, B, C), (_, B_h, C_h) = pressure, heat
+    t, e = _likeness(B, B_h, transposed=True), _likeness(C, C_h)
+    both = t.duplicate()
+    both.pointwiseMult(t, e)
+    return {(k, h): t, (h, k): e, (h, h): both}
+
+
+def _likeness(A: PETSc.Mat, B: PETSc.Mat, *, transposed: bool = False) -> PETSc.Vec:
+    """By how much rows of B, or columns, are those of A multiplied: b_i = f_i a_i. Collective.
+
+    From products with vectors at random: exact where rows are proportional, else near to least squares. 0 for rows
+    of zeros in A.
+    """
+    (across, along), random = A.createVecs(), np.random.default_rng(5)
+    if transposed:
+        across, along = along, across
+    above = below = np.zeros(along.getLocalSize())
+    for _ in range(4):
+        across.setArray(random.standard_normal(across.getLocalSize()))
+        parts = []
+        for M in (A, B):
+            (M.multTranspose if transposed else M.mult)(across, along)
+            parts.append(along.getArray().copy())
+        above, below = above + parts[0] * parts[1], below + parts[0] ** 2
+    across.destroy()
+    along.setArray(np.divide(above, below, out=np.zeros_like(above), where=below > 0))
+    return along
 
 
 def checked(

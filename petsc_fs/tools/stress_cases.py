@@ -49,7 +49,7 @@ class Recipe:
     refinement: float = 0.3  # cells are 100 m / refinement wide
     step: tuple[int, int] = (1, 1)  # time step, from 1, and Newton step, from 0, or the last one before it
     parameters: Mapping[str, Any] = field(default_factory=dict)  # of `ModelParameters`
-    rock: Mapping[str, Any] = field(default_factory=dict)  # of `Rock`; also `storage`, 1/M in 1/Pa
+    rock: Mapping[str, Any] = field(default_factory=dict)  # of the model's `Rock`; also `storage`, 1/M in 1/Pa
     case: Mapping[str, Any] = field(default_factory=dict)  # changes of `Case`
     twist: Mapping[str, Any] = field(default_factory=dict)  # what no parameter says, see `scripts/stress_scenes`
     quick: bool = False  # see `StressCase`

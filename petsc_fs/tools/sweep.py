@@ -609,7 +609,8 @@ def _compared(name: str, s: Summary) -> list[str]:
 
 EPILOG = """\
 A space is a YAML file that names a base options file and what may change in it; amg.yaml (multigrid of mechanics and
-pressure) and flow.yaml (small, for a first try) come along, and petsc_fs/tools/space.py explains the format.
+pressure), heat.yaml (that of pressure and temperature) and flow.yaml (small, for a first try) come along, and
+petsc_fs/tools/space.py explains the format.
 
 The folder --out holds the sweep: the same command again goes on where it was interrupted or killed, and one with
 more --trials goes on from its end. In it are, at the end,
