@@ -521,7 +521,11 @@ def test_results_without_a_solved_trial_are_written_all_the_same(tmp_path: Path,
     ("arguments", "code", "says"),
     [
         (["flow.h5"], 2, "--space"),
-        (["flow.h5", "--space", "nothing"], 2, "space nothing: no such file; shipped are amg.yaml, flow.yaml, heat.yaml"),
+        (
+            ["flow.h5", "--space", "nothing"],
+            2,
+            "space nothing: no such file; shipped are amg.yaml, flow.yaml, heat.yaml",
+        ),
         (["model1.h5", "--space", "flow"], 2, "model1.h5: flow.opts is for scenes with the fields intf_flow, mass"),
         (["flow.h5", "flow.h5", "--space", "flow"], 2, "flow.h5: named twice"),
         (["flow.h5", "--space", "flow", "--trials", "0"], 2, "--trials: expected a positive number, found 0"),
