@@ -11,6 +11,7 @@ import ctypes
 import re
 import resource
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,25 +24,15 @@ RESET_PEAK = "5"
 """Written to `CLEAR`, sets the peak of resident memory back to its present value (Linux 4.0 and later)."""
 
 
-LARGE = 1 << 20
-"""Bytes from which on `return_freed` has malloc ask the system for each block by itself."""
+def return_freed() -> None:
+    """Give what is freed back to the system, so that it does not count as held. Local.
 
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_MMAP_MAX = -1, -3, -4  # of <malloc.h>
-MMAP_BLOCKS = 1 << 16  # glibc's default
-
-
-def return_freed() -> bool:
-    """Have malloc give large blocks back to the system when they are freed; whether it will. Local.
-
-    It would by itself, were it not for SuperLU_DIST, which forbids it for the whole process as soon as it is
-    loaded, and many builds of PETSc load it. Without effect where the C library is not glibc.
+    The C library may keep it otherwise. That it gives large blocks back by itself is forbidden for the whole process
+    by SuperLU_DIST, which many builds of PETSc load, and has its price: in a run of PorePy, which makes and frees
+    matrices all the time, page faults were a quarter of the time. Without effect where the C library is not glibc.
     """
-    try:
-        mallopt = ctypes.CDLL(None).mallopt
-    except (OSError, AttributeError):
-        return False
-    settings = ((M_MMAP_MAX, MMAP_BLOCKS), (M_MMAP_THRESHOLD, LARGE), (M_TRIM_THRESHOLD, LARGE))
-    return all([mallopt(what, value) == 1 for what, value in settings])
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def held() -> int:
@@ -96,6 +87,7 @@ class Phases:
     def end(self, phase: str) -> None:
         """The phase that began with the end of the last one is over; it may have several parts. Local."""
         self.peaks[phase] = max(peak(), self.peaks.get(phase, 0))
+        return_freed()
         self.helds[phase] = held()
         self.separate = reset_peak() and self.separate
 

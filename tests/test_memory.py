@@ -1,6 +1,7 @@
 """Memory by phase, and that the large blocks of a scene are not held more often than needed."""
 
 import gc
+import platform
 import subprocess
 import sys
 import weakref
@@ -22,10 +23,7 @@ MIB = 1 << 20
 linux = pytest.mark.skipif(not memory.CLEAR.exists(), reason="needs Linux's /proc")
 
 
-@pytest.fixture
-def returns_freed():
-    if not memory.return_freed():
-        pytest.skip("needs glibc")
+glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="needs glibc")
 
 
 def in_own_process(call: str) -> str:
@@ -39,7 +37,8 @@ def in_own_process(call: str) -> str:
 
 
 @linux
-def test_a_phase_has_its_own_peak(returns_freed: None):
+@glibc
+def test_a_phase_has_its_own_peak():
     separate, large_peak, large_held, small_peak = map(int, in_own_process("print_phases").split())
     assert separate
     assert large_peak > 60 * MIB > large_held
@@ -48,7 +47,6 @@ def test_a_phase_has_its_own_peak(returns_freed: None):
 
 def print_phases() -> None:
     """Whether peaks are separate, and bytes since the start: peak and held with a large array, peak after it."""
-    memory.return_freed()
     phases = memory.Phases()
     array = np.ones(8 * MIB)
     del array
@@ -109,15 +107,16 @@ def test_source_is_freed_once_petsc_has_it(release: bool):
 
 
 @linux
-def test_building_does_not_hold_the_matrix_twice(returns_freed: None):
+@glibc
+def test_building_does_not_hold_the_matrix_twice():
     assert abs(float(in_own_process("build_and_print"))) < 3, "a copy is 12 bytes an entry"
 
 
 def build_and_print() -> None:
     """Bytes held after building a system, per entry of its matrix."""
-    memory.return_freed()
     scene = banded_scene(rows=12_000, width=150)
     entries = scene.blocks["momentum", "momentum"].data.size
+    memory.return_freed()
     phases = memory.Phases()
     solver = Solver(scene, MPI.COMM_SELF, release=True)
     phases.end("build")
@@ -126,13 +125,13 @@ def build_and_print() -> None:
 
 
 @linux
-def test_nothing_is_left_of_a_destroyed_solver(returns_freed: None):
+@glibc
+def test_nothing_is_left_of_a_destroyed_solver():
     assert abs(float(in_own_process("destroy_and_print"))) < 0.2, "1 is a matrix for each solver"
 
 
 def destroy_and_print() -> None:
     """Bytes that three solvers leave behind, made and destroyed one after the other, in matrices."""
-    memory.return_freed()
     held = []
     for _ in range(5):
         scene = banded_scene(rows=6_000, width=100)
@@ -142,6 +141,7 @@ def destroy_and_print() -> None:
         scene.blocks["mass", "mass"] = identity
         size = 12 * scene.blocks["momentum", "momentum"].data.size
         Solver(scene, MPI.COMM_SELF, release=True).destroy()
+        memory.return_freed()
         held.append(memory.held())
     print((held[-1] - held[1]) / 3 / size)
 

@@ -19,7 +19,7 @@ from petsc_fs.fields import learn_aliases
 from petsc_fs.io import hdf5, sequence
 from petsc_fs.io.bundled import check_targets, find_scene, versions
 from petsc_fs.io.files import write_text
-from petsc_fs.memory import Phases, return_freed
+from petsc_fs.memory import Phases
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -97,7 +97,6 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
         if given.files:
             options.fitting_file(str(given.files[0]), steps[0].sizes)
     given.start(petscrc=args.petscrc)
-    return_freed()
     smallest = not given.files or "pc_type" not in given.values
     player = Player(path, comm, smallest=smallest)
     args.close = player.close

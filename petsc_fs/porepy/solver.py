@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 
 from petsc_fs import options, server
 from petsc_fs.errors import SolveError, UsageError
-from petsc_fs.memory import return_freed
 from petsc_fs.porepy.forcing import EisenstatWalker, EisenstatWalkerParameters
 from petsc_fs.scene import Scene, contact_state_counts
 
@@ -155,7 +154,6 @@ class FieldSplitSolver:
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._client = server.join()
-        return_freed()  # or the process grows with each Newton step: PorePy frees what malloc then keeps
         super().__init__(*args, **kwargs)
         self.linear_solves = []
         self._adapter: Adapter | None = None
