@@ -214,6 +214,21 @@ class Refinement:
             "Krylov method failed on another right-hand side",
         )
 
+    def sharpen(self, error: float) -> None:
+        """One correction more where the root mean square of the error, by estimate, is larger. Collective.
+
+        Args:
+            error: wanted in the units of the user's system, if rounding allows it.
+        """
+        if self.missing > 1.0 or not (self.passes and self.is_determined):
+            return
+        self._precondition()
+        rms = math.ldexp(self.d.norm(), -self.system.rhs_scale) / math.sqrt(self.d.getSize() or 1)
+        found = rms / self._spectrum.least
+        if found > error and self.iterations < self.max_it and max(self.check.backward.values()) > LIMIT:
+            self._pass(max(error / found, LEAST_RTOL))
+            self._take_step()
+
     def _precondition(self) -> None:
         """D = M^-1 r. Collective."""
         try:

@@ -18,13 +18,14 @@ whose pattern has changed are laid out anew, the others only get values.
 from __future__ import annotations
 
 import atexit
+import math
 import os
 import signal
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -38,10 +39,12 @@ if TYPE_CHECKING:
     from petsc_fs.partition import Layout
     from petsc_fs.result import Result
     from petsc_fs.scene import Scene
-    from petsc_fs.solver import Solver
 
 SECONDS_TO_AGREE = 5.0
 """How long a rank that failed waits for the others before it takes them for stuck."""
+
+LEAST_ROWS = 5000
+"""Default of -petsc_fs_least_rows."""
 
 SHORTEST_NAP, LONGEST_NAP = 1e-5, 5e-3
 """Seconds between two looks for a message: the longest keeps a waiting rank below 1 % of a core."""
@@ -96,6 +99,20 @@ class Client:
                 self._send("set_options", options)
                 self._options = options
             return self._send(command, *args, load=load)
+
+    def share(self, function: Callable[[Any], Any], tasks: Sequence[Any]) -> list[Any]:
+        """Have each rank apply a function to its task, and collect what comes of it. Collective for those who listen.
+
+        Args:
+            function: known to all ranks by its name.
+            tasks: one for each rank.
+
+        Raises:
+            Exception: of the function, of the lowest rank that had one.
+        """
+        self.call("work", function, load=tasks)
+        results: list[Any] = self.call("collect")
+        return results
 
     def drop(self, handle: int) -> None:
         """Forget a solver on all ranks, at the next opportunity. Local: garbage collection may call it."""
@@ -215,23 +232,24 @@ class ServedSolver:
         if scene.sizes != self._sizes or not self._client.rank.knows(self._handle):
             self.rebuilds += 1
             self._sizes = {}  # an error on the way leaves nothing to start from
-            self.layout = self._client.call("build", self._handle, self.prefix, load=scene)
+            self.layout = self._client.call("build", self._handle, self.prefix, sum(scene.sizes.values()), load=scene)
             self._sizes = dict(scene.sizes)
         else:
             self._client.call("update", self._handle, load=scene)
         self.transfer_seconds = time.perf_counter() - started
 
-    def solve(self, rtol: float | None = None) -> Result:
+    def solve(self, rtol: float | None = None, *, error: float = math.inf) -> Result:
         """Solve; see `petsc_fs.solver.Solver.solve`.
 
         Args:
             rtol: relative tolerance of this solve.
+            error: that the solution should have at most.
 
         Returns:
             What the solve did; `solution` has all rows of each field in the scene's numbering.
         """
         result: Result
-        result, solution, seconds = self._client.call("solve", self._handle, rtol)
+        result, solution, seconds = self._client.call("solve", self._handle, rtol, error)
         self.transfer_seconds += seconds
         return replace(result, solution=solution)
 
@@ -252,7 +270,9 @@ class _Rank:
     def __init__(self, comm: MPI.Intracomm) -> None:
         self.comm = comm
         self.control = pkl5.Intracomm(comm.Dup())  # its messages may be larger than 2 GiB
-        self._kept: dict[int, Solver] = {}
+        self._kept: dict[int, Any] = {}  # solvers, None where this rank has no part in one
+        self._comms: dict[int, MPI.Intracomm | None] = {comm.size: comm}
+        self._result: Any = None
 
     def execute(self, command: str, args: Sequence[Any], load: Any = None) -> Any:
         """Do something on all ranks. Collective.
@@ -316,26 +336,51 @@ class _Rank:
             if name not in mine or mine[name] != value:
                 database.setValue(name, value)
 
-    def build(self, handle: int, prefix: str, scene: Scene | None = None) -> Layout:
-        """Make a solver for the scene that rank 0 has."""
+    def build(self, handle: int, prefix: str, unknowns: int, scene: Scene | None = None) -> Layout | None:
+        """Make a solver for the scene that rank 0 has, on as many ranks as it is large enough for."""
         from petsc_fs.solver import Solver
 
         self.drop(handle)
-        self._kept[handle] = Solver(scene, self.comm, prefix=prefix, root_only=True)
-        return self._kept[handle].layout
+        comm = self._first(min(max(unknowns // _least_rows(prefix), 1), self.comm.size))
+        self._kept[handle] = None if comm is None else Solver(scene, comm, prefix=prefix, root_only=True)
+        return None if comm is None else self._kept[handle].layout
+
+    def _first(self, ranks: int) -> MPI.Intracomm | None:
+        """A communicator of the first ranks; None on the others. Collective."""
+        if ranks not in self._comms:
+            part = self.comm.Split(0 if self.comm.rank < ranks else MPI.UNDEFINED)
+            self._comms[ranks] = part if isinstance(part, MPI.Intracomm) and part != MPI.COMM_NULL else None
+        return self._comms[ranks]
 
     def update(self, handle: int, scene: Scene | None = None) -> None:
         """Give a solver the next scene."""
-        self._kept[handle].update(scene)
+        if self._kept[handle] is not None:
+            self._kept[handle].update(scene)
 
-    def solve(self, handle: int, rtol: float | None) -> tuple[Result, Any, float]:
-        """What the solve did; on rank 0 all of the solution; seconds it took to come."""
-        solver = self._kept.get(handle)
-        if solver is None:
+    def solve(self, handle: int, rtol: float | None, error: float) -> tuple[Result, Any, float] | None:
+        """What the solve did; on rank 0 all of the solution; seconds it took to come. None on ranks without a part."""
+        if handle not in self._kept:
             raise SolveError("there is nothing to solve: an earlier error left no system")
-        result = solver.solve(rtol)
+        solver = self._kept[handle]
+        if solver is None:
+            return None
+        result = solver.solve(rtol, error=error)
         started = time.perf_counter()
         return result, solver.system.gather(result.solution), time.perf_counter() - started
+
+    def work(self, function: Callable[[Any], Any], tasks: Sequence[Any] = ()) -> None:
+        """Apply a function to this rank's task of those that rank 0 has; `collect` brings the results."""
+        for other in range(1, len(tasks)):
+            self.control.send(tasks[other], other)
+        self._result = function(tasks[0] if self.comm.rank == 0 else self.control.recv(source=0))
+
+    def collect(self) -> list[Any]:
+        """On rank 0 what `work` has made on each rank, in their order."""
+        result, self._result = self._result, None
+        if self.comm.rank == 0:
+            return [result, *(self.control.recv(source=other) for other in range(1, self.comm.size))]
+        self.control.send(result, 0)
+        return []
 
     def drop(self, handle: int) -> None:
         """Forget a solver."""
@@ -366,6 +411,13 @@ def _serve(rank: _Rank) -> None:
     finally:
         if in_main_thread and before is not None:
             signal.signal(signal.SIGINT, before)
+
+
+def _least_rows(prefix: str) -> int:
+    """Unknowns that a rank should have. Local, the same on all ranks."""
+    from petsc4py import PETSc
+
+    return max(int(PETSc.Options(prefix).getInt("petsc_fs_least_rows", LEAST_ROWS)), 1)
 
 
 def _naps() -> Iterator[None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 import time
 import weakref
 from collections.abc import Iterator, Mapping
@@ -202,7 +203,13 @@ class Solver:
                 raise
         self._built_seconds += time.perf_counter() - started
 
-    def solve(self, rtol: float | None = None, rhs: Mapping[str, NDArray[np.float64]] | None = None) -> Result:
+    def solve(
+        self,
+        rtol: float | None = None,
+        rhs: Mapping[str, NDArray[np.float64]] | None = None,
+        *,
+        error: float = math.inf,
+    ) -> Result:
         """Solve for the right-hand side of the scene, from a zero initial guess. Collective.
 
         The Krylov method runs to its tolerance; where its solution does not count as converged (see `Result`), it runs
@@ -212,6 +219,8 @@ class Solver:
         Args:
             rtol: relative tolerance of this solve, if a looser one than -ksp_rtol is enough.
             rhs: another right-hand side for the same matrix, given as that of the scene was; kept for further solves.
+            error: root mean square over all unknowns that the error of the solution should have at most; where the
+                tolerances leave more of it, by estimate, there is another correction. That decides nothing.
 
         Raises:
             SolveError: PETSc failed on the way, or the solution is not finite.
@@ -222,7 +231,7 @@ class Solver:
         file = PETSc.Options(self.prefix).getString("petsc_fs_retry", "none")
         first: Result | SolveError | SceneError
         try:
-            first = self._first(wanted)
+            first = self._first(wanted, error)
         except (SolveError, SceneError) as e:
             if file == "none":
                 raise
@@ -237,14 +246,14 @@ class Solver:
         self._built_seconds = 0.0
         return result
 
-    def _first(self, wanted: float) -> Result:
+    def _first(self, wanted: float, error: float) -> Result:
         """By the options of this solver. Collective."""
         self.set_up()
         with self._options():
-            result = self._run(self.ksp, wanted)
+            result = self._run(self.ksp, wanted, error)
             return result if result.converged else self._look_for_null_vectors(result, wanted)
 
-    def _run(self, ksp: PETSc.KSP, wanted: float) -> Result:
+    def _run(self, ksp: PETSc.KSP, wanted: float, error: float = math.inf) -> Result:
         """The Krylov method and its corrections, and what comes of them. Collective."""
         started = time.perf_counter()
         system = self.system
@@ -253,6 +262,8 @@ class Solver:
             run.first()
             run.correct()
             run.estimate_error()
+            if error < math.inf:
+                run.sharpen(error)
             run.explain()
             self._history = np.concatenate(run.history) if run.history else np.zeros(0)
             with np.errstate(over="ignore"):

@@ -419,6 +419,7 @@ def make_model(
             "units": pp.Units(kg=MASS_UNIT),
             "linear_solver": "pypardiso" if find_spec("pypardiso") else "scipy_sparse",
             "adaptive_indicator_scaling": 1,
+            "nl_convergence_tol": NEWTON["nl_convergence_tol"],
         }
         | _reference_values(rock)
     )

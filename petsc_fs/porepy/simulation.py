@@ -98,8 +98,8 @@ def command(args: argparse.Namespace, petsc: list[str], comm: MPI.Intracomm) -> 
         given = options.Given.of(petsc)
         if len(given.files) > 1:
             raise UsageError("-options_file: a run takes one")
+        require_porepy()  # on all ranks, which discretise
         if comm.rank == 0:
-            require_porepy()
             _make_folder(folder)
     given.start(files=False)
     error: BaseException | None = None

@@ -47,6 +47,14 @@ FORCING = ("fixed", "eisenstat_walker")
 RETRY_FILE = "retry.opts"
 """-petsc_fs_retry where -petsc_fs_on_failure is retry."""
 
+INCREMENT_TOLERANCE = 1e-10
+"""PorePy's default of `nl_convergence_tol`, the root mean square of the increment that ends Newton's method; what a
+model has says `check_convergence`, after the first solve."""
+
+UNNOTICED = 0.3
+"""Part of it that the error of the first update in a time step may have: it is the next increment if all is linear, and
+would be taken for a sign that another step is needed."""
+
 FIRST = "first solve: "
 """How the note of a solve that was tried again begins."""
 
@@ -114,7 +122,9 @@ class FieldSplitSolver:
 
     - `petsc_fs_options_file`: path of the options file, or name of a shipped one; default is the one for the
       fields of the model;
-    - `petsc_fs_options_prefix`: put before all option names, default "".
+    - `petsc_fs_options_prefix`: put before all option names, default "";
+    - `nl_convergence_tol`, as PorePy's Newton method has it, until that tells: the first update of a time step gets a
+      correction more where its error would not pass for convergence.
 
     The options of the file are in PETSc's database only while a system is being solved, and what
     stands there already goes first: after `petsc4py.init(sys.argv)` the command line wins, and
@@ -131,6 +141,10 @@ class FieldSplitSolver:
             makes use of it, but never further than to -ksp_rtol; see `petsc_fs.porepy.forcing.EisenstatWalker`.
             Residuals are measured as Newton does, by the model's `compute_residual_norm`. Its parameters are those of
             `petsc_fs.porepy.forcing.EisenstatWalkerParameters`.
+        -petsc_fs_keep_affine <true>: parts of equations that are affine in the unknowns are evaluated again only when
+            what they are made of has changed; see `petsc_fs.porepy.equations`.
+        -petsc_fs_share <true>: large grids are discretised by all ranks.
+        -petsc_fs_least_rows <5000>: unknowns that a rank should have; smaller systems are solved on fewer ranks.
 
     Attributes:
         linear_solves: one record per solve, in the order of solving.
@@ -162,7 +176,23 @@ class FieldSplitSolver:
         self._values: dict[str, str | None] = {}
         self._forcing: EisenstatWalker | None = None
         self._newton_tolerance: float | None = None
+        self._increment_tolerance = float(self.params.get("nl_convergence_tol", INCREMENT_TOLERANCE))
         self._reference_residual: Floats | None = None
+
+    def set_equation_system_manager(self) -> None:
+        """PorePy's own, with an equation system that does less in each Newton step, and has help from waiting ranks."""
+        from petsc4py import PETSc
+
+        from petsc_fs.porepy.equations import EquationSystem
+
+        if not hasattr(self, "equation_system"):
+            keep, share = (
+                PETSc.Options(self._options_prefix).getBool(f"petsc_fs_{what}", True)
+                for what in ("keep_affine", "share")
+            )
+            client = self._client if share else None
+            self.equation_system = EquationSystem(self.mdg, keep=keep, client=client)  # type: ignore[attr-defined]
+        super().set_equation_system_manager()  # type: ignore[misc]
 
     def discretize(self) -> None:
         """PorePy's own, once it is clear that unknowns and equations of the model pair up."""
@@ -186,7 +216,8 @@ class FieldSplitSolver:
             residual = self._nonlinear_residual(scene)
             forcing = self._forcing_term(residual)
             solver = self._updated_solver(scene)
-            result = solver.solve(forcing)
+            first = scene.metadata.newton_index == 0 and forcing is None
+            result = solver.solve(forcing, error=UNNOTICED * self._increment_tolerance if first else math.inf)
             if not self.linear_solves:
                 self._refuse_unused()
         action, failure = self._judge(result, policy)
@@ -198,7 +229,7 @@ class FieldSplitSolver:
                 time_step=scene.metadata.time_step_index,
                 newton_index=scene.metadata.newton_index,
                 unknowns=update.size,
-                ranks=1 if self._client is None else self._client.comm.size,
+                ranks=solver.layout.comm.size,
                 iterations=result.iterations,
                 passes=result.passes,
                 reason=result.reason,
@@ -228,6 +259,7 @@ class FieldSplitSolver:
         """PorePy's own, which tells on the way what the nonlinear tolerance is."""
         given = kwargs.get("nl_params", args[-1] if args else None)
         if isinstance(given, dict):
+            self._increment_tolerance = float(given.get("nl_convergence_tol", math.inf))
             tolerance = float(given.get("nl_convergence_tol_res", math.inf))
             self._newton_tolerance = tolerance if math.isfinite(tolerance) else None
         return super().check_convergence(*args, **kwargs)  # type: ignore[misc]
