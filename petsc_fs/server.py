@@ -108,7 +108,7 @@ class Client:
             tasks: one for each rank.
 
         Raises:
-            Exception: of the function, of the lowest rank that had one.
+            Exception: of the function, of the lowest rank that had one; of others than this as `portable` has it.
         """
         self.call("work", function, load=tasks)
         results: list[Any] = self.call("collect")

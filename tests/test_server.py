@@ -34,10 +34,12 @@ def on_rank_0(body) -> None:
     client = server.start(comm)
     if client is None:
         return
+    PETSc.Options().setValue("petsc_fs_least_rows", "1")  # however small, on all ranks
     try:
         body(client)
     finally:
         client.stop()
+        PETSc.Options().delValue("petsc_fs_least_rows")
 
 
 # Server and solver
@@ -102,6 +104,43 @@ def test_patterns_may_change_and_only_other_sizes_take_a_new_solver(database):
         solver.update(load("model1"))  # other grids
         assert solver.rebuilds == 1
         assert solver.solve().converged
+
+    on_rank_0(body)
+
+
+@pytest.mark.mpi
+def test_small_systems_are_solved_on_fewer_ranks(database):
+    """And larger ones at the same time on all, also where a system grows."""
+    database("flow.opts")
+    small = load("flow")  # of 1,248 unknowns
+
+    def body(client):
+        for least, ranks in ((5000, 1), (1248, 1), (624, min(2, comm.size)), (1, comm.size)):
+            PETSc.Options().setValue("petsc_fs_least_rows", least)
+            solver = ServedSolver(client, small)
+            assert solver.layout.comm.size == ranks
+            for _ in range(2):
+                result = solver.solve()
+                confirm(small, result, result.solution)
+                solver.update(small)
+
+    on_rank_0(body)
+
+
+def _part_of(task):
+    if task == "broken":
+        raise ValueError("a task that cannot be done")
+    return task, comm.rank
+
+
+@pytest.mark.mpi
+def test_work_is_shared():
+    def body(client):
+        tasks = [f"task {r}" for r in range(comm.size)]
+        assert client.share(_part_of, tasks) == [(task, r) for r, task in enumerate(tasks)]
+        with pytest.raises((ValueError, RuntimeError), match="a task that cannot be done"):
+            client.share(_part_of, [*tasks[:-1], "broken"])
+        assert client.share(_part_of, tasks)[-1] == (tasks[-1], comm.size - 1)
 
     on_rank_0(body)
 

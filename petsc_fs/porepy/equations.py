@@ -98,7 +98,9 @@ class EquationSystem(pp.ad.EquationSystem):
     def _discretize_together(self, client: Client, discretization: Any, grid: Any) -> bool:
         """Discretise a grid on all ranks, if that can be and pays; whether it was."""
         ranks = client.comm.size
-        if type(discretization) not in SHARED or grid.num_cells < SMALLEST_PART * ranks:
+        # Of a plane in space a part has other axes than the whole, and signs with them.
+        embedded = grid.dim < self.mdg.dim_max()
+        if type(discretization) not in SHARED or embedded or grid.num_cells < SMALLEST_PART * ranks:
             return False
         data, keyword = self.mdg.subdomain_data(grid), discretization.keyword
         parameters = data[pp.PARAMETERS][keyword]
@@ -253,10 +255,10 @@ class Kept(pp.ad.Operator):
         checksum = _checksum(coefficients) if derivative or self._ad is None else self._checksum
         fits = self._ad is not None and self._ad.jac.shape[1] == x.size and checksum == self._checksum
         if not (fits and _same(coefficients, self._coefficients)):
-            self._ad = self._operator.value_and_jacobian(system, x)
+            self._ad = _evaluate(self._operator, system, x, True)
             self._values = self._ad.val
         elif not _same(others, self._others):
-            self._values = self._operator.value(system, x)
+            self._values = _evaluate(self._operator, system, x, False)
         else:
             self._values = self._values_then + self._ad.jac @ (x - self._x_then)  # not A x + c, which would cancel
             self._derivative = derivative
@@ -270,6 +272,13 @@ class Kept(pp.ad.Operator):
             return self._values
         self._ad.val = self._values
         return self._ad
+
+
+def _evaluate(operator: Any, system: Any, x: Floats, derivative: bool) -> Any:
+    """Values of an operator, with derivatives or without; PorePy 1.10 has it as methods of operators."""
+    if hasattr(system, "evaluate"):
+        return system.evaluate(operator, derivative, x)
+    return (operator.value_and_jacobian if derivative else operator.value)(system, x)
 
 
 def _replaced(operator: Any, kept: list[Kept]) -> Any:
