@@ -11,7 +11,6 @@ import json
 import math
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -351,20 +350,12 @@ class Observed:
     simulation: Simulation
     stop: type[Exception]
 
+    set_geometry = _timed("set_geometry", "meshing")
     set_discretization_parameters = _timed("set_discretization_parameters", "discretisation")
     discretize = _timed("discretize", "discretisation")
     rediscretize = _timed("rediscretize", "discretisation")
     assemble_linear_system = _timed("assemble_linear_system", "assembly")
     save_data_time_step = _timed("save_data_time_step", "output")
-
-    def set_geometry(self) -> None:
-        """Mesh."""
-        handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-        with self.simulation.phase("meshing"):
-            super().set_geometry()  # type: ignore[misc]
-        if threading.current_thread() is threading.main_thread():
-            for number, handler in handlers.items():  # gmsh leaves some that end the process at once
-                signal.signal(number, handler if handler is not None else signal.SIG_DFL)
 
     def solve_linear_system(self) -> Floats:
         """Solve, by the next class that does."""

@@ -14,7 +14,9 @@ from __future__ import annotations
 import logging
 import math
 import os
+import signal
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -178,6 +180,14 @@ class FieldSplitSolver:
         self._newton_tolerance: float | None = None
         self._increment_tolerance = float(self.params.get("nl_convergence_tol", INCREMENT_TOLERANCE))
         self._reference_residual: Floats | None = None
+
+    def set_geometry(self) -> None:
+        """PorePy's own; gmsh leaves handlers of signals that end the process at once, which are taken back."""
+        handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        super().set_geometry()  # type: ignore[misc]
+        if threading.current_thread() is threading.main_thread():
+            for number, handler in handlers.items():
+                signal.signal(number, handler if handler is not None else signal.SIG_DFL)
 
     def set_equation_system_manager(self) -> None:
         """PorePy's own, with an equation system that does less in each Newton step, and has help from waiting ranks."""
