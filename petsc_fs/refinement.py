@@ -223,9 +223,8 @@ class Refinement:
         if self.missing > 1.0 or not (self.passes and self.is_determined):
             return
         self._precondition()
-        rms = math.ldexp(self.d.norm(), -self.system.rhs_scale) / math.sqrt(self.d.getSize() or 1)
-        found = rms / self._spectrum.least
-        if found > error and self.iterations < self.max_it and max(self.check.backward.values()) > LIMIT:
+        found = math.ldexp(self.d.norm(), -self.system.rhs_scale) / math.sqrt(self.d.getSize() or 1)
+        if found > error and self.iterations < self.max_it:
             self._pass(max(error / found, LEAST_RTOL))
             self._take_step()
 

@@ -294,9 +294,11 @@ SHIPPED |= {
     )
     for d, grid in ((2, "cartesian"), (2, "simplex"), (3, "cartesian"))
 }
-ONE_MORE = {"case_1_conductive_simplex"}
-"""Linear models whose first update, to -ksp_rtol, is still further from the solution than PorePy's tolerance for the
-increment after it."""
+
+
+ONE_MORE = {"heavy"}
+"""Models of which rounding says whether a time step takes one step more: with 1e-16 at random added to the updates of
+the direct solver, the increment that decides is between 1.5e-11 and 7e-10, where 1e-10 is asked for."""
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -309,7 +311,8 @@ def test_newton_takes_as_many_steps_to_the_same_state(tmp_path, monkeypatch, cap
     assert not [record for record in caplog.records if record.name == "petsc_fs"]
     assert len(ours.linear_solves) == sum(steps for steps, _ in found) > 0
     direct, expected = run(*SHIPPED[name](), Direct, {})
-    assert [steps for steps, _ in found] == [steps + (name in ONE_MORE) for steps, _ in expected]
+    more = [steps - least for (steps, _), (least, _) in zip(found, expected, strict=True)]
+    assert set(more) <= ({0, 1} if name in ONE_MORE else {0})
     adapter = Adapter(direct)
     for (_, state), (_, exact) in zip(found, expected, strict=True):
         assert_same(adapter, state, exact, zero=1e-25)  # some tractions are 0

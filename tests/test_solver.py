@@ -34,6 +34,7 @@ from petsc_fs import options
 from petsc_fs.errors import LayoutError, SceneError, SolveError, UsageError
 from petsc_fs.fields import FIELD
 from petsc_fs.partition import Layout
+from petsc_fs.result import Result
 from petsc_fs.scene import CSR, Scene
 from petsc_fs.solver import Solver
 from petsc_fs.tools import reference, stress_cases
@@ -74,6 +75,32 @@ def test_without_options_the_default_file_of_the_fields_solves_it(clean, name):
     assert max(result.error_by_field.values()) < 1e-4
     assert clean.getAll() == before
     assert any("no contact" in str(line) for line in solver.left_out) == ("contact" not in scene.fields)
+    solver.destroy()
+
+
+@pytest.mark.parametrize("name", ["model2", "model3"])
+def test_a_smaller_error_can_be_asked_for(clean, name):
+    """By one correction; a wish that cannot be had changes no verdict."""
+    scene = load(name)
+    solver = Solver(scene)
+
+    def error(result: Result) -> float:
+        """Root mean square over all unknowns."""
+        found = solver.system.gather(result.solution)
+        if comm.rank:
+            return comm.bcast(None)
+        square = sum(np.sum((found[f] - exact) ** 2) for f, exact in scene.reference.items())
+        return comm.bcast(float(np.sqrt(square / sum(scene.sizes.values()))))
+
+    plain = solver.solve(1e-6)
+    assert solver.solve(1e-6, error=1e3 * error(plain)).passes == plain.passes
+    sharp = solver.solve(1e-6, error=1e-2 * error(plain))
+    assert len(sharp.passes) == len(plain.passes) + 1
+    assert error(sharp) < 0.1 * error(plain)
+    best = solver.solve(1e-6, error=1e-300)
+    assert best.converged
+    assert len(best.passes) <= len(plain.passes) + 1
+    assert error(best) <= error(plain)
     solver.destroy()
 
 

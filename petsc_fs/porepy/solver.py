@@ -53,7 +53,7 @@ INCREMENT_TOLERANCE = 1e-10
 """PorePy's default of `nl_convergence_tol`, the root mean square of the increment that ends Newton's method; what a
 model has says `check_convergence`, after the first solve."""
 
-UNNOTICED = 0.3
+UNNOTICED = 0.1
 """Part of it that the error of the first update in a time step may have: it is the next increment if all is linear, and
 would be taken for a sign that another step is needed."""
 
