@@ -65,8 +65,9 @@ class Place:
         Raises:
             PetscFsError: the exit code is none of those that are fine.
         """
-        folders = "|".join(f"{re.escape(str(folder))}/" for folder in (self.scratch, self.scenes, ROOT))
-        call = re.sub(folders, "", " ".join(words))
+        folders = self.scratch, self.scenes, ROOT / "petsc_fs" / "scenes", ROOT
+        shown = "|".join(f"{re.escape(str(folder))}/" for folder in folders)
+        call = re.sub(shown, "", " ".join(words))
         self.say(call)
         self.commands.append(call)
         python = [sys.executable]
