@@ -79,3 +79,9 @@ def test_pages_are_made_from_what_is_there(tmp_path):
     (tmp_path / "speed.md").write_text(re.sub(f"(?<={file} )[0-9a-f]+", "0", page))
     said = f"docs/speed.md: {file} is not what it was made from; scripts/pages speed makes it anew\n"
     assert check("speed", "--docs", str(tmp_path)) == (1, said, "")
+
+
+@pytest.mark.parametrize("name", sorted(MADE))
+def test_a_page_that_is_made_is_in_the_index(name):
+    assert f"| [{name}.md]({name}.md) |" in (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
+    assert f"{name}.md\n" in (ROOT / "scripts" / "docs.yml").read_text(encoding="utf-8")

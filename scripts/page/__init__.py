@@ -51,7 +51,7 @@ class Place:
     docs: Path
     scratch: Path
     scenes: Path
-    rounds: int = 5
+    rounds: int = 3
     commands: list[str] = field(default_factory=list)
     exported: dict[str, Path] = field(default_factory=dict)
 
@@ -111,8 +111,7 @@ class Place:
     ) -> dict[tuple[str, int, str], list[measure.Record]]:
         """Records of `rounds` rounds, by scene, ranks and variant, measured in turns.
 
-        Each solve has a process of its own; with `batch` a process takes all scenes by a variant, each twice, of which
-        the first is not counted.
+        Each solve has a process of its own; with `batch` a process takes all scenes by a variant, one after the other.
 
         Raises:
             PetscFsError: a solve has not converged, and may not fail.
@@ -120,7 +119,7 @@ class Place:
         paths = {str(self.scene(name)): name for name in scenes}
         chosen = [replace(measure.Variant.of(words), label=words) for words in variants]
         found: dict[tuple[str, int, str], list[measure.Record]] = {}
-        job, how = measure.Job(warm_up=batch, keep_going=True), {"ranks": ranks, "repeat": self.rounds, "batch": batch}
+        job, how = measure.Job(keep_going=True), {"ranks": ranks, "repeat": self.rounds, "batch": batch}
         for records in measure.measure_all(list(paths), chosen, job, **how):
             for record in records:
                 key = paths[record["scene"]], record["ranks"], record["variant"]
@@ -141,6 +140,11 @@ def span(values: Iterable[float]) -> str:
     """The least and the greatest, in words that other pages quote."""
     known = sorted(values)
     return f"{known[0]:.1f} to {known[-1]:.1f}"
+
+
+def short(value: float) -> str:
+    """Two digits, without an exponent."""
+    return f"{float(f'{value:.2g}'):g}"
 
 
 def unknowns(path: Path) -> int:
@@ -219,8 +223,8 @@ def end(name: str, place: Place) -> str:
         f"Made by `scripts/pages {name}` {_commit()}, {time.strftime('%Y-%m-%d')}; {about['processor']}; "
         f"threads per rank: {about['threads per rank']}; {versions}.",
     ]
-    for words, calls in (("It ran", place.commands), ("Scenes are of", place.exported)):
-        lines += ["", f"{words} {', '.join(f'`{call}`' for call in calls)}{_porepy(place)}."] if calls else []
+    for words, calls in (("It ran", place.commands), (f"Scenes are of {_porepy(place)}:", place.exported)):
+        lines += ["", f"{words} {', '.join(f'`{call}`' for call in calls)}."] if calls else []
     inputs = "; ".join(f"{path} {digest}" for path, digest in digests(name).items())
     return "\n".join([*lines, "", f"<!-- {MARK}: {inputs} -->"]) + "\n"
 
@@ -231,7 +235,7 @@ def _porepy(place: Place) -> str:
     for path in place.exported.values():
         with hdf5.open_file(path) as file:
             found |= {f"PorePy {file['producers'].attrs['porepy']}"}
-    return f" ({', '.join(sorted(found))})" * bool(found)
+    return ", ".join(sorted(found))
 
 
 def _commit() -> str:

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from page import Place, draw
+from page import Place, draw, short
 from petsc_fs.tools.compare import METHOD, SUMMARY, Comparison, fastest, points, summary
 from petsc_fs.tools.pages import markdown
 
@@ -49,7 +49,7 @@ def make(place: Place) -> str:
         where = f"{case.dimension}D, {sum(case.sizes.values()):,} unknowns"
         mine = {file: [p for p in measured if (p.scene, p.file) == (case.label, file) and p.ended] for file in FILES}
         first = {file: fastest(run, ACCURACY, "total") for file, run in mine.items()}
-        seconds = [f"{best.seconds:.2g} s" if best else "no time that was seen" for best in first.values()]
+        seconds = [f"{short(best.seconds)} s" if best else "no time that was seen" for best in first.values()]
         rows.append([case.label, where, *seconds])
         if case.label in SHOWN:
             curves[where] = {FILES[f]: [(p.seconds["total"].median, p.error) for p in run] for f, run in mine.items()}
