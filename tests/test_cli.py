@@ -7,6 +7,7 @@ rank are provoked in this process.
 import importlib.util
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -431,12 +432,12 @@ needs_matplotlib = pytest.mark.skipif(importlib.util.find_spec("matplotlib") is 
 
 @needs_matplotlib
 def test_inspect_draws_a_picture(tmp_path):
-    done = run("inspect", "contact.h5", "--plot", "blocks.png", cwd=tmp_path)
+    done = run("inspect", "contact.h5", "--plot", "blocks.svg", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.endswith("block structure drawn in blocks.png\n")
-    picture = (tmp_path / "blocks.png").read_bytes()
-    assert picture[:8] == b"\x89PNG\r\n\x1a\n"
-    assert len(picture) > 10000
+    assert done.stdout.endswith("block structure drawn in blocks.svg\n")
+    texts = set(re.findall("<!-- (.*) -->", (tmp_path / "blocks.svg").read_text(encoding="utf-8")))
+    legend = {"empty", "block of $J$", "block that the step changes", "singular block", "entry of $J$"}
+    assert texts > legend | {"1 contact", "3 momentum", "$J_{23}$"}
 
 
 @needs_matplotlib
