@@ -25,6 +25,7 @@ from petsc_fs.cli.main import main, split_arguments
 from petsc_fs.errors import SceneError, UsageError
 from petsc_fs.io import hdf5
 from petsc_fs.io.bundled import check_targets, find_scene
+from petsc_fs.porepy.cases import describe_permeability
 from petsc_fs.scene import contact_state_counts
 
 MPIEXEC = Path(petsc_fs.__path__[0]).parent / "scripts" / "mpiexec"
@@ -334,6 +335,21 @@ def test_inspect_shows_fields_and_contact_states_once(tmp_path, ranks):
     assert done.stdout.count(f"contact states: {states}\n") == 1
     assert "kg = 1e+10" in done.stdout
     assert "porepy 1.11" in done.stdout
+    assert "fracture permeability: 1 m^2 as in the published code, not the cubic law\n" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("model", "words"),
+    [
+        ("model1", "not the cubic law"),
+        ("model2 (refinement=2, fracture_permeability=cubic)", r"the cubic law, aperture\^2"),
+        ("model1 (friction=0.1, physics=restricted)", "that of the rock"),
+        ("contact (refinement=2)|biot|mine", "^$"),
+    ],
+)
+def test_scenes_of_models_tell_the_permeability_of_fractures(model, words):
+    for name in model.split("|"):
+        assert re.search(words, describe_permeability(name))
 
 
 @pytest.mark.parametrize("words", [["inspect", "flow.h5"], ["solve", "flow.h5", "-ksp_monitor"], ["--help"]], ids=str)
