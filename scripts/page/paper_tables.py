@@ -1,7 +1,7 @@
 """The tables of the paper, beside what is printed and the published code, and what differs from the paper's words.
 
-Runs of models are kept in docs/paper_tables.json with a digest of their options: only those that are missing there, or
-whose options have changed, are made again. All of them take some three hours.
+Runs of models are kept in docs/paper_tables.json with a digest of their options and of the models' numbers: only those
+that are missing there, or whose digest is another, are made again. All of them take some three hours.
 """
 
 import hashlib
@@ -9,7 +9,7 @@ import itertools
 import json
 import math
 import subprocess
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from statistics import median
@@ -59,6 +59,8 @@ run, an asterisk where there are only the first time steps of one. Every solve s
 residuals that are neither scaled nor corrected; by its own rules, petsc_fs would not have called {missed} solves
 converged. Runs were made with the package as of {commits}.
 
+{words}
+
 ## Table 1: fixed-stress Richardson over K_n and F
 
 Model 1 at refinement 1 with restricted physics. P̂ is the paper's operator of two blocks with direct solves, P that of
@@ -99,12 +101,12 @@ with direct sub-solves and with multigrid and ILU(0).
 
 ![Fracture cells by contact state, and iterations, over the Newton steps of a run](model2_contact_states.png)
 
-Model 2 by the cubic law at refinement 2, as in the paper's figure: fracture cells by contact state over the Newton
-steps, shaded and white for time steps in turns, and the iterations of each solve.
+The run by the cubic law at refinement 2: fracture cells by contact state over the Newton steps, shaded and white for
+time steps in turns, the iterations of each solve, and where the cells are.
 
 ![Block structure of a Jacobian and of what each level leaves](model2_blocks.png)
 
-Its Jacobian (of the bundled `model2.h5`), and what each level of the preconditioner leaves.
+A Jacobian of the model by 1 m² (the bundled `model2.h5`), and above it what each level of the preconditioner leaves.
 
 ## Table 4: four fractures in 3D, refined
 
@@ -119,7 +121,10 @@ The paper saw no notable difference between Q_r and a transformation Q_l from th
 
 ## Solve by solve
 
-Runs follow the published ones until rounding decides on the contact state of a cell. {parity}
+Runs follow the published ones until rounding decides on the contact state of a cell. Newton steps are over the time
+steps that both have.
+
+{parity}
 """
 
 Record = Mapping[str, Any]
@@ -146,9 +151,9 @@ class Run:
     steps: int = 6  # all
 
     def digest(self) -> str:
-        """Of the options; comments in the file do not count."""
-        words = sorted((options.parse(ROOT / f"options/{self.file}.opts") | dict(self.changes)).items())
-        return hashlib.sha256(repr(words).encode()).hexdigest()[:12]
+        """Of the options, comments apart, and of the numbers of the model."""
+        words = sorted(options.parse(ROOT / f"options/{self.file}.opts").items())
+        return hashlib.sha256(repr((words, CASES[self.model], self)).encode()).hexdigest()[:12]
 
 
 RICHARDSON = {"ksp_type": "richardson", "ksp_pc_side": "left", "ksp_norm_type": "preconditioned", "ksp_max_it": "1000"}
@@ -160,7 +165,11 @@ TABLE_1: dict[str, tuple[str, str, dict[str, str]]] = {
 """What it is called, options file and changes to it."""
 PLACES = ("y0.05", "y0.3", "y0.5", "y0.7", "y0.95", "x0.05", "x0.3", "x0.5", "x0.7", "x0.95")
 """Of the fracture of model 1: level at this part of the domain's height, or upright at this part of its width."""
-LAWS = {"model1": (both := {"": "1 m²", "_cubic": "cubic law"}), "model2": both, "model3": {"": "as the rock"}}
+LAWS = {
+    "model1": (both := {"": "1 m²", "_cubic": "cubic law"}),
+    "model2": both,
+    "model3": {"": "permeability of the rock"},
+}
 """Permeability of the fractures by the end of a run's name."""
 COLUMNS = {"newton": ("Newton", "", 0), "direct": ("GMRES dir.", "_direct", 1), "amg": ("GMRES AMG", "", 1)}
 """Heading, the part of the run's name that says which sub-solvers, and which of its `means`."""
@@ -208,7 +217,7 @@ def solver_commit() -> str:
     return subprocess.run(log, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
 
 
-def make_run(name: str, say: Any = print) -> dict[str, Any]:
+def make_run(name: str, say: Callable[[str], object] = print) -> dict[str, Any]:
     """Run a model.
 
     The Krylov method stops as the published code does: in the norm of the rows as they are, without the corrections
@@ -231,7 +240,7 @@ def make_run(name: str, say: Any = print) -> dict[str, Any]:
     model.params["petsc_fs_options_file"] = f"{this.file}.opts"
     if this.fracture:
         model.case = replace(model.case, fractures=(this.fracture,))
-    record: dict[str, Any] = {"options": this.digest(), "commit": solver_commit(), "failed": "", "history": []}
+    record: dict[str, Any] = {"digest": this.digest(), "commit": solver_commit(), "failed": "", "history": []}
     published = {"ksp_rtol": RTOL / MARGIN}  # of which the Krylov method is given the part MARGIN
     published |= {} if model.parameters.physics == "restricted" else {"ksp_atol": ATOL / MARGIN}
 
@@ -344,11 +353,11 @@ def places(records: Records) -> list[str]:
     near = [records[f"richardson_{place}"] for place in PLACES if not 0.1 < float(place[1:]) < 0.9]
     middle = means(records["richardson_y0.5"])[1]
     more = sum(bool(record["failed"]) or means(record)[1] > middle for record in near)
-    words = f"Of {len(near)} places within 0.1 km of a side, {more} take more than y = 0.5 km with P̂, or fail. In the "
+    words = f"Places within 0.1 km of a side where P̂ takes more than at y = 0.5 km, or fails: {more} of {len(near)}. In the "
     words += (
         f"first solve of each run all cells stick; its count with P̂ is {' or '.join(map(str, sorted(set(first))))}."
     )
-    words += f" Where a run fails, the linear solve diverges ({'; '.join(failed)})." * bool(failed)
+    words += f" Runs fail where the linear solve diverges: {'; '.join(dict.fromkeys(failed))}." * bool(failed)
     return [*markdown(headings, rows, numbers=True), "", words]
 
 
@@ -376,43 +385,34 @@ def table_of(model: str, records: Records) -> list[str]:
     """Refinements of a model, and below how far full runs are from the paper, and what the others are."""
     table, rows, notes = PAPER[model], [], []
     columns = {c: words for c, words in COLUMNS.items() if any(table[c])}
-    off: dict[str, dict[str, float]] = {c: {} for c in columns}  # by column and source
-    sources = [("published code", "", published)]
-    sources += [(f"petsc_fs, {words}", law, records.get) for law, words in LAWS[model].items()]
+    heads = [heading for heading, *_ in columns.values()]
+    sources = {"published code": ("", published)}
+    sources |= {f"petsc_fs, {words}": (law, records.get) for law, words in LAWS[model].items()}
+    off: dict[str, dict[str, float]] = {words: {} for words in sources}
     for i, refinement in enumerate(table["refinement"]):
         printed = (decimal(table[c][i]) for c in columns)
         rows.append([f"{refinement:g}", "paper", f"{table['unknowns'][i]:,}", *printed])
-        for words, law, source in sources:
+        for words, (law, source) in sources.items():
             found = {c: source(f"{model}_g{refinement:g}{solver}{law}") for c, (_, solver, _) in columns.items()}
             if any(found.values()):
                 size = next((f"{r['unknowns']:,}" for r in found.values() if r and "unknowns" in r), "")
                 rows.append(["", words, size, *(shown(r, columns[c][2]) for c, r in found.items())])
             for c, record in found.items():
-                steps = len(record["history"]) if record else 0
-                if 0 < steps < STEPS:
-                    notes.append(
-                        f"{words}, refinement {refinement:g}: time steps 1 to {steps}, {len(solves(record))} solves"
-                    )
+                if record and len(record["history"]) < STEPS:
+                    steps = f"time step {len(record['history'])}, {len(solves(record))} solves"
+                    notes.append(f"{words}, refinement {refinement:g}: up to {steps}")
                 elif record and not record["failed"] and table[c][i]:
-                    off[c][words] = max(off[c].get(words, 0), abs(means(record)[columns[c][2]] - table[c][i]))
-    lines = [
-        *markdown(["refinement", "", "unknowns", *(head for head, *_ in columns.values())], rows, numbers=True),
-        "",
-    ]
-    lines += ["Largest difference from the paper, of full runs:", ""]
-    ours = [words for words, *_ in sources]
-    lines += markdown(
-        ["", *(head for head, *_ in columns.values())],
-        [[words, *(f"{off[c][words]:.1f}" if words in off[c] else "-" for c in columns)] for words in ours],
-        numbers=True,
-    )
-    nearest = {c: min(ours[1:], key=lambda words: off[c][words]) for c in columns if c != "newton"}
+                    off[words][c] = max(off[words].get(c, 0), abs(means(record)[columns[c][2]] - table[c][i]))
+    lines = [*markdown(["refinement", "", "unknowns", *heads], rows, numbers=True), ""]
+    lines += [f"\\* Not all time steps: {'; '.join(dict.fromkeys(notes))}.", ""] * bool(notes)
+    rows = [[words, *(decimal(off[words].get(c)) for c in columns)] for words in sources]
+    lines += ["Largest difference from the paper, of full runs:", "", *markdown(["", *heads], rows, numbers=True)]
+    del off["published code"]
+    nearest = {c: min(off, key=lambda words: off[words][c]) for c in columns if c != "newton"}
     if len(set(nearest.values())) > 1:
-        each = ", ".join(
-            f"{columns[c][0]} is nearest by {words.removeprefix('petsc_fs, ')}" for c, words in nearest.items()
-        )
-        lines += ["", f"No one setting gives the whole table: {each}."]
-    return lines + ["", f"\\* Not all time steps: {'; '.join(dict.fromkeys(notes))}."] * bool(notes)
+        each = ", ".join(f"{columns[c][0]} by {words.removeprefix('petsc_fs, ')}" for c, words in nearest.items())
+        lines += ["", f"No one setting is nearest to the paper in both: {each}."]
+    return lines
 
 
 def left(records: Records) -> list[str]:
@@ -427,22 +427,23 @@ def left(records: Records) -> list[str]:
     return [*markdown(["run", "Q_r", "Q_l", "Q_l / Q_r"], rows, numbers=True), "", words]
 
 
-def parity(records: Records) -> list[str]:
-    """Solve by solve beside the published code."""
+def parity(records: Records) -> tuple[str, list[str]]:
+    """Solve by solve beside the published code: in words, and each run."""
     rows, total, largest = [], [0, 0], 0
     for name, record in records.items():
         theirs = published(name)
         if theirs is not None:
-            difference, alike = compare(record, theirs)
-            n = len(solves({"history": record["history"][: len(theirs["history"])]}))
+            ours = {"history": record["history"][: len(theirs["history"])]}
+            difference, alike = compare(ours, theirs)
+            n = len(solves(ours))
             total = [total[0] + alike, total[1] + n]
             largest = max(largest, difference or 0)
-            means_of = [f"{means(r)[0]:.1f}" for r in (theirs, record)]
+            means_of = [f"{means(r)[0]:.1f}" for r in (theirs, ours)]
             rows.append([name, *means_of, f"{alike} of {n}", "-" if difference is None else difference])
     words = f"{total[0]} of {total[1]} solves start from as many sticking, sliding and open cells as in the published "
     words += f"run; the numbers of iterations then differ by at most {largest}."
     headings = ["run", "Newton, published", "petsc_fs", "alike", "largest difference"]
-    return [words, "", *markdown(headings, rows, numbers=True)]
+    return words, markdown(headings, rows, numbers=True)
 
 
 def make(place: Place) -> str:
@@ -451,7 +452,7 @@ def make(place: Place) -> str:
     store = place.docs / "paper_tables.json"
     records: dict[str, Any] = json.loads(store.read_text(encoding="utf-8")) if store.exists() else {}
     for name, this in sorted(RUNS.items(), key=lambda item: -item[1].steps):  # large ones last
-        if records.get(name, {}).get("options") != this.digest():
+        if records.get(name, {}).get("digest") != this.digest():
             records[name] = make_run(name, place.say)
             lines = (f"{json.dumps(n)}: {json.dumps(records[n], separators=(',', ':'))}" for n in RUNS if n in records)
             write_text(store, "{\n" + ",\n".join(lines) + "\n}\n")
@@ -471,21 +472,22 @@ def make(place: Place) -> str:
     ]
     cells = np.array(centers), np.array(states)
     plot_contact_states(steps, place.docs / "model2_contact_states.png", title="model 2, refinement 2", cells=cells)
-    everything = [row for record in records.values() for row in solves(record)]
     missed = sum(record["missed"] for record in records.values())
+    in_words, solve_by_solve = parity(records)
     parts = {
         "table_1": table_1(records),
-        **{model: table_of(model, records) for model in LAWS},
         "places": places(records),
         "correlations": correlations(records),
+        **{model: table_of(model, records) for model in LAWS},
         "left": left(records),
-        "parity": parity(records),
+        "parity": solve_by_solve,
     }
     words = {
         "source": PAPER["source"],
         "origin": COUNTS["published_code"]["origin"],
         "porepy": version("porepy"),
         "commits": ", ".join(sorted({record["commit"] for record in records.values()})),
-        "missed": f"{missed} of {len(everything)}",
+        "missed": f"{missed} of {sum(len(solves(record)) for record in records.values())}",
+        "words": in_words,
     }
     return PAGE.format(**words, **{name: "\n".join(lines) for name, lines in parts.items()})
