@@ -235,8 +235,8 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 DASHES = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (6, 1.5, 1.2, 1.5)), (0, (3, 1)))
 OUTCOME_COLOURS = {"right": "#0072B2", "refusal": "#F0E442", "wrong": "#D55E00", "hang": "#CC79A7", "crash": "#000000"}
-MARKS = {"refusal": "–", "wrong": "×", "hang": "∞", "crash": "!"}
-"""What stands in a field of the matrix, for whom colours are not enough."""
+MARKS = {"refusal": "", "wrong": " ×", "hang": " ∞", "crash": " !"}
+"""What stands behind the number in a field of the matrix, for whom colours are not enough."""
 
 
 def look(number: int) -> dict[str, Any]:
@@ -292,36 +292,45 @@ def _plain(axis: Any) -> None:
 def plot_matrix(
     cases: Sequence[Mapping[str, Any]], findings: Sequence[Mapping[str, Any]], outcomes: Sequence[str], path: Path
 ) -> Path:
-    """Draw outcomes: a row for each case under its group, a column for each options file and number of ranks."""
+    """Draw outcomes: a row for each options file, a column for each group of cases.
+
+    A field has the colour of the worst outcome, and the number of cases that end so on some number of ranks.
+    """
     plt = pyplot()
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
-    columns = list(dict.fromkeys((f["file"], f["ranks"]) for f in findings))
-    rows: list[str] = []
-    for group in dict.fromkeys(case["group"] for case in cases):
-        rows += [f"[{group}]", *(case["name"] for case in cases if case["group"] == group)]
-    grid = np.full((len(rows), len(columns)), np.nan)
-    figure, axes = plt.subplots(figsize=(3.2 + 0.2 * len(columns), 3.0 + 0.145 * len(rows)), layout="constrained")
+    group_of = {case["name"]: case["group"] for case in cases}
+    groups, files = list(dict.fromkeys(group_of.values())), list(dict.fromkeys(f["file"] for f in findings))
+    fields: dict[tuple[int, int], dict[str, int]] = {}  # to the worst outcome of each case
     for f in findings:
-        i, j = rows.index(f["case"]), columns.index((f["file"], f["ranks"]))
-        grid[i, j] = outcomes.index(f["outcome"])
-        colour = "black" if f["outcome"] == "refusal" else "white"
-        axes.text(j, i, MARKS.get(f["outcome"], ""), ha="center", va="center", fontsize=7, color=colour)
+        worst = fields.setdefault((files.index(f["file"]), groups.index(group_of[f["case"]])), {})
+        worst[f["case"]] = max(worst.get(f["case"], 0), outcomes.index(f["outcome"]))
+    grid = np.full((len(files), len(groups)), np.nan)
+    figure, axes = plt.subplots(figsize=(6, 2.2 + 0.2 * len(files)), layout="constrained")
+    for (i, j), worst in fields.items():
+        grid[i, j] = number = max(worst.values())
+        name, count = outcomes[number], list(worst.values()).count(number)
+        text = f"{count}{MARKS[name]}" if name in MARKS else ""
+        colour = "black" if name == "refusal" else "white"
+        axes.text(j, i, text, ha="center", va="center_baseline", fontsize=9, color=colour)
     shades = ListedColormap([OUTCOME_COLOURS[name] for name in outcomes])
     axes.imshow(grid, cmap=shades, vmin=-0.5, vmax=len(outcomes) - 0.5, aspect="auto", interpolation="none")
-    axes.set_yticks(range(len(rows)), rows, fontsize=8)
-    names = [f"{file.removesuffix('.opts')}, {n}" for file, n in columns]
-    axes.set_xticks(range(len(columns)), names, rotation=90, fontsize=7)
+    axes.set_yticks(range(len(files)), [file.removesuffix(".opts") for file in files], fontsize=9)
+    sizes = [f"{group}, {list(group_of.values()).count(group)}" for group in groups]
+    axes.set_xticks(range(len(groups)), sizes, rotation=35, ha="left", rotation_mode="anchor", fontsize=9)
     axes.xaxis.tick_top()
     axes.tick_params(length=0)
-    axes.set_xlabel("options file, ranks")
-    axes.set_xticks(np.arange(1, len(columns)) - 0.5, minor=True)
-    axes.set_yticks(np.arange(1, len(rows)) - 0.5, minor=True)
-    axes.grid(which="minor", color="white", linewidth=0.6)
-    handles = [Patch(facecolor=OUTCOME_COLOURS[name], label=f"{name} {MARKS.get(name, '')}") for name in outcomes]
+    axes.set_xlabel("what makes cases hard, and their number", fontsize=9)
+    axes.xaxis.set_label_position("top")
+    axes.set_xticks(np.arange(1, len(groups)) - 0.5, minor=True)
+    axes.set_yticks(np.arange(1, len(files)) - 0.5, minor=True)
+    axes.grid(which="minor", color="white", linewidth=1)
+    ends = {"right": "all right", "refusal": "so many refused"}
+    shown = [name for k, name in enumerate(outcomes) if name in ends or (grid == k).any()]
+    handles = [Patch(facecolor=OUTCOME_COLOURS[n], label=ends.get(n, f"so many: {n}{MARKS.get(n)}")) for n in shown]
     handles.append(Patch(facecolor="white", edgecolor="grey", label="not for these fields"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=9, frameon=False)
     return _save(figure, path)
 
 

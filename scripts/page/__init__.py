@@ -17,14 +17,17 @@ import re
 import subprocess
 import sys
 import time
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from statistics import median
 from types import ModuleType
 
 from petsc_fs.errors import PetscFsError, UsageError
 from petsc_fs.io import hdf5
 from petsc_fs.io.bundled import find_scene
 from petsc_fs.tools import measure
+from petsc_fs.tools.plots import look, pyplot
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = tuple(sorted(module.name for module in pkgutil.iter_modules([str(Path(__file__).parent)])))
@@ -48,7 +51,7 @@ class Place:
     docs: Path
     scratch: Path
     scenes: Path
-    rounds: int = 5
+    rounds: int = 3
     commands: list[str] = field(default_factory=list)
     exported: dict[str, Path] = field(default_factory=dict)
 
@@ -57,17 +60,19 @@ class Place:
         measure.say(line)
 
     def run(self, *words: str, fine: tuple[int, ...] = (0,)) -> str:
-        """What a call of petsc-fs or python prints, run in `scratch`; the call goes into the page.
+        """What a call of petsc-fs, python or mpiexec prints, run in `scratch`; the call goes into the page.
 
         Raises:
             PetscFsError: the exit code is none of those that are fine.
         """
-        folders = "|".join(f"{re.escape(str(folder))}/" for folder in (self.scratch, self.scenes, ROOT))
-        call = re.sub(folders, "", " ".join(words))
+        folders = self.scratch, self.scenes, ROOT / "petsc_fs" / "scenes", ROOT
+        shown = "|".join(f"{re.escape(str(folder))}/" for folder in folders)
+        call = re.sub(shown, "", " ".join(words))
         self.say(call)
         self.commands.append(call)
-        programs = {"petsc-fs": [sys.executable, "-m", "petsc_fs"], "python": [sys.executable]}
-        command = [*programs[words[0]], *words[1:]]
+        python = [sys.executable]
+        programs = {"petsc-fs": [*python, "-m", "petsc_fs"], "python": python, "mpiexec": measure.launcher(0)[:1]}
+        command = [part for word in words for part in programs.get(word, [word])]
         done = subprocess.run(
             command, cwd=self.scratch, env=measure.environment(), stdout=subprocess.PIPE, text=True, check=False
         )
@@ -94,6 +99,81 @@ class Place:
                 raise PetscFsError(f"it needs what `{recipe}` writes, in the folder that --scenes names")
         self.exported[recipe] = path
         return path
+
+    def measured(
+        self,
+        scenes: Sequence[str],
+        variants: Sequence[str],
+        ranks: Sequence[int] = (1,),
+        *,
+        batch: bool = False,
+        may_fail: bool = False,
+    ) -> dict[tuple[str, int, str], list[measure.Record]]:
+        """Records of `rounds` rounds, by scene, ranks and variant, measured in turns.
+
+        Each solve has a process of its own; with `batch` a process takes all scenes by a variant, one after the other.
+
+        Raises:
+            PetscFsError: a solve has not converged, and may not fail.
+        """
+        paths = {str(self.scene(name)): name for name in scenes}
+        chosen = [replace(measure.Variant.of(words), label=words) for words in variants]
+        found: dict[tuple[str, int, str], list[measure.Record]] = {}
+        job, how = measure.Job(keep_going=True), {"ranks": ranks, "repeat": self.rounds, "batch": batch}
+        for records in measure.measure_all(list(paths), chosen, job, **how):
+            for record in records:
+                key = paths[record["scene"]], record["ranks"], record["variant"]
+                self.say(f"{key}: {record['kind']} {record['iterations']} {record['seconds']} {record['message']}")
+                if not may_fail and record["kind"] != "converged":
+                    raise PetscFsError(f"{record['variant']} on {key[0]}: {record['kind']} {record['message']}")
+                found.setdefault(key, []).append(record)
+        return found
+
+
+def spread(values: Iterable[float]) -> str:
+    """Median, and in brackets the least and the greatest."""
+    known = sorted(values)
+    return f"{median(known):.2f} ({known[0]:.2f}–{known[-1]:.2f})"
+
+
+def span(values: Iterable[float]) -> str:
+    """The least and the greatest, in words that other pages quote."""
+    known = sorted(values)
+    return f"{known[0]:.1f} to {known[-1]:.1f}"
+
+
+def short(value: float) -> str:
+    """Two digits, without an exponent."""
+    return f"{float(f'{value:.2g}'):g}"
+
+
+def unknowns(path: Path) -> int:
+    """Of a scene."""
+    return sum(hdf5.read_sizes(path)[1].values())
+
+
+def draw(
+    path: Path, panels: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]], x: Sequence[str], y: Sequence[str]
+) -> None:
+    """Draw two panels of curves, by their titles and labels, on logarithmic axes.
+
+    In a size to be read on a screen of 420 pixels. With the same y, they share the axis and the legend.
+    """
+    plt = pyplot()
+    plt.rcParams.update({"font.size": 9, "axes.titlesize": 9})
+    shared = y[0] == y[1]
+    figure, axes = plt.subplots(1, 2, figsize=(6, 3.4), sharey=shared, layout="constrained")
+    for k, (panel, (title, curves)) in enumerate(zip(axes, panels.items(), strict=True)):
+        for number, (label, points) in enumerate(curves.items()):
+            panel.plot(*zip(*points, strict=True), label=label, **look(number))
+        panel.set(xscale="log", yscale="log", title=title, xlabel=x[k], ylabel="" if k and shared else y[k])
+        panel.grid(color="#DDDDDD")
+        if not shared:
+            panel.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), frameon=False)
+    if shared:
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    figure.savefig(path, dpi=200)
+    plt.close(figure)
 
 
 def module_of(name: str) -> ModuleType:
@@ -143,8 +223,8 @@ def end(name: str, place: Place) -> str:
         f"Made by `scripts/pages {name}` {_commit()}, {time.strftime('%Y-%m-%d')}; {about['processor']}; "
         f"threads per rank: {about['threads per rank']}; {versions}.",
     ]
-    for words, calls in (("It ran", place.commands), ("Scenes are of", place.exported)):
-        lines += ["", f"{words} {', '.join(f'`{call}`' for call in calls)}{_porepy(place)}."] if calls else []
+    for words, calls in (("It ran", place.commands), (f"Scenes are of {_porepy(place)}:", place.exported)):
+        lines += ["", f"{words} {', '.join(f'`{call}`' for call in calls)}."] if calls else []
     inputs = "; ".join(f"{path} {digest}" for path, digest in digests(name).items())
     return "\n".join([*lines, "", f"<!-- {MARK}: {inputs} -->"]) + "\n"
 
@@ -155,7 +235,7 @@ def _porepy(place: Place) -> str:
     for path in place.exported.values():
         with hdf5.open_file(path) as file:
             found |= {f"PorePy {file['producers'].attrs['porepy']}"}
-    return f" ({', '.join(sorted(found))})" * bool(found)
+    return ", ".join(sorted(found))
 
 
 def _commit() -> str:
