@@ -8,6 +8,7 @@ import hashlib
 import itertools
 import json
 import math
+import re
 import subprocess
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -275,7 +276,7 @@ def make_run(name: str, say: Callable[[str], object] = print) -> dict[str, Any]:
         try:
             run(model, on_newton_step=look)
         except SolveError as e:
-            record["failed"] = str(e).partition(": NOT CONVERGED")[0]
+            record["failed"] = re.sub(": NOT CONVERGED.*(DIVERGED_[A-Z]+).*", r", \1", str(e))
     missed = sum(not solve.converged for solve in model.linear_solves)
     return record | {"unknowns": model.linear_solves[0].unknowns, "missed": missed}
 
@@ -345,19 +346,17 @@ def places(records: Records) -> list[str]:
         last = solves(found[-1])
         first.append(solves(found[0])[0][0] + 1)
         where = f"{'upright' if place[0] == 'x' else 'level'}, {place[0]} = {place[1:]} km"
-        failed += [
-            f"{kind[0]} {where}: {r['failed']}" for kind, r in zip(TABLE_1.values(), found, strict=True) if r["failed"]
-        ]
+        failed += [f"{where}, {record['failed']}" for record in found if record["failed"]]
         rows.append([where, *map(shown, found), max(row[3] for row in last), f"{median(row[6] for row in last):.1e}"])
     headings = ["fracture", *(words for words, *_ in TABLE_1.values()), "open cells", "4 G D (Pa/m)"]
     near = [records[f"richardson_{place}"] for place in PLACES if not 0.1 < float(place[1:]) < 0.9]
     middle = means(records["richardson_y0.5"])[1]
     more = sum(bool(record["failed"]) or means(record)[1] > middle for record in near)
-    words = f"Places within 0.1 km of a side where P̂ takes more than at y = 0.5 km, or fails: {more} of {len(near)}. In the "
-    words += (
-        f"first solve of each run all cells stick; its count with P̂ is {' or '.join(map(str, sorted(set(first))))}."
+    words = (
+        f"Places within 0.1 km of a side where P̂ takes more than at y = 0.5 km, or fails: {more} of {len(near)}. In "
     )
-    words += f" Runs fail where the linear solve diverges: {'; '.join(dict.fromkeys(failed))}." * bool(failed)
+    words += f"the first solve of each run all cells stick; its count is {' or '.join(map(str, sorted(set(first))))}."
+    words += f" Failures: {'; '.join(dict.fromkeys(failed))}." * bool(failed)
     return [*markdown(headings, rows, numbers=True), "", words]
 
 
