@@ -416,14 +416,14 @@ def table_of(model: str, records: Records) -> list[str]:
 
 def left(records: Records) -> list[str]:
     """The transformation from the left beside that from the right."""
-    names = [name for name in records if "_left" in name]
-    rows, more = [], 0
-    for name in names:
-        found = [means(records[n])[1] for n in (name.replace("_left", ""), name)]
-        more += found[1] > found[0]
-        rows.append([name.replace("_left", ""), *(f"{mean:.1f}" for mean in found), f"{found[1] / found[0]:.2f}"])
-    words = f"From the left it takes more in {more} of {len(names)} runs."
-    return [*markdown(["run", "Q_r", "Q_l", "Q_l / Q_r"], rows, numbers=True), "", words]
+    rows, ratios = [], []
+    for name in (name for name in records if "_left" in name):
+        right = name.replace("_left", "")
+        counts = [means(records[n])[1] for n in (right, name)]
+        ratios.append(counts[1] / counts[0])
+        rows.append([right, *map(decimal, counts)])
+    words = f"Q_l has {min(ratios):.2f} to {max(ratios):.2f} times the count of Q_r."
+    return [*markdown(["run", "Q_r", "Q_l"], rows, numbers=True), "", words]
 
 
 def parity(records: Records) -> tuple[str, list[str]]:
