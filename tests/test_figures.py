@@ -5,6 +5,7 @@ text (between blank lines) with figures has to link to a page of `scripts/pages`
 are not looked at: other tests run them, and hold what they print against what README and examples say of it.
 """
 
+import os
 import re
 import subprocess
 import sys
@@ -65,20 +66,29 @@ def test_a_figure_that_is_not_is_found():
     assert untraced(page, "\n\n".join([text, *more])) == list(more.values())
 
 
-def check(*words: str) -> tuple[int, str, str]:
-    """What `scripts/pages --check` says."""
-    command = [sys.executable, str(ROOT / "scripts" / "pages"), "--check", *words]
-    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=False)
+def pages(*words: str, **environment: str) -> tuple[int, str, str]:
+    """Exit code and output of `scripts/pages`."""
+    command = [sys.executable, str(ROOT / "scripts" / "pages"), *words]
+    done = subprocess.run(command, env=ENVIRONMENT | environment, capture_output=True, text=True, check=False)
     return done.returncode, done.stdout, done.stderr
 
 
 def test_pages_are_made_from_what_is_there(tmp_path):
-    assert check() == (0, "", "")
+    assert pages("--check") == (0, "", "")
     page = (ROOT / "docs" / "speed.md").read_text(encoding="utf-8")
     file = "options/contact_poromechanics_fast.opts"
     (tmp_path / "speed.md").write_text(re.sub(f"(?<={file} )[0-9a-f]+", "0", page))
     said = f"docs/speed.md: {file} is not what it was made from; scripts/pages speed makes it anew\n"
-    assert check("speed", "--docs", str(tmp_path)) == (1, said, "")
+    assert pages("--check", "speed", "--docs", str(tmp_path)) == (1, said, "")
+
+
+def test_a_page_that_lacks_its_scenes_is_left_as_it_is(tmp_path):
+    (tmp_path / "porepy.py").write_text("raise ImportError('not here')")
+    words = ("speed", "--docs", str(tmp_path), "--scenes", str(tmp_path / "scenes"))
+    code, _, said = pages(*words, PYTHONPATH=os.pathsep.join([str(tmp_path), ENVIRONMENT["PYTHONPATH"]]))
+    assert code == 1
+    assert "docs/speed.md is not made: it needs what `petsc-fs export model1 --refine 10 --steps 1:1` writes" in said
+    assert not (tmp_path / "speed.md").exists()
 
 
 @pytest.mark.parametrize("name", sorted(MADE))

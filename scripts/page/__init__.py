@@ -168,6 +168,12 @@ def draw(
             panel.plot(*zip(*points, strict=True), label=label, **look(number))
         panel.set(xscale="log", yscale="log", title=title, xlabel=x[k], ylabel="" if k and shared else y[k])
         panel.grid(color="#DDDDDD")
+        low, high = panel.get_xlim()
+        if high < 1e4 * low:
+            marks = range(1, 10) if high < 4 * low else (1, 2, 5) if high < 50 * low else (1,)
+            panel.xaxis.set_major_locator(plt.LogLocator(subs=marks))
+            panel.xaxis.set_major_formatter("{x:,g}")
+            panel.xaxis.set_minor_formatter("")
         if not shared:
             panel.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), frameon=False)
     if shared:
@@ -220,7 +226,7 @@ def end(name: str, place: Place) -> str:
         "",
         "---",
         "",
-        f"Made by `scripts/pages {name}` {_commit()}, {time.strftime('%Y-%m-%d')}; {about['processor']}; "
+        f"Made by `scripts/pages {name}` {_commit(digests(name))}, {time.strftime('%Y-%m-%d')}; {about['processor']}; "
         f"threads per rank: {about['threads per rank']}; {versions}.",
     ]
     for words, calls in (("It ran", place.commands), (f"Scenes are of {_porepy(place)}:", place.exported)):
@@ -238,13 +244,13 @@ def _porepy(place: Place) -> str:
     return ", ".join(sorted(found))
 
 
-def _commit() -> str:
-    """The commit that is checked out, and whether code or options differ from it."""
+def _commit(inputs: Iterable[str]) -> str:
+    """The commit that is checked out, and whether code, options or inputs differ from it."""
 
     def git(*words: str) -> str:
         done = subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True, check=False)
         return done.stdout.strip()
 
-    changed = git("status", "--porcelain", "--untracked-files=no", "--", "petsc_fs", "options", "scripts", "tests")
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", "petsc_fs", "options", *inputs)
     commit = git("rev-parse", "--short", "HEAD")
     return f"at commit {commit}{', with changes' * bool(changed)}" if commit else "outside of git"

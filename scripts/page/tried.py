@@ -31,7 +31,6 @@ WON = {
     "Gauss-Seidel forward and backward": AMG + SYMMETRIC,
     "both of these for pressure": f"{MASS}{COARSE.format(MASS)} {MASS}{SYMMETRIC}",
     "a restart after 30 iterations": "-ksp_gmres_restart 30",
-    "cells in the order of the grid": "-petsc_fs_ordering natural",
     "multigrid of mechanics with all entries": f"{MECHANICS}component_drop 0",
     "multigrid of pressure with all entries": f"{BELOW}1_fs_drop 0",
     "fixed stress as published for fractures, too": f"{BELOW}1_fs_fractures 0",
@@ -104,7 +103,8 @@ Each of these is taken back alone:
 5. **Cells along a space-filling curve** (`-petsc_fs_ordering`, by itself on large parts). Grid generators number
    cells almost at random, and where the vectors of a product do not fit into caches, each entry of a sparse matrix
    may wait for memory. Morton's curve needs nothing but centres of cells; recursive bisection and reverse
-   Cuthill-McKee gain no more. The published file gains from it as well.
+   Cuthill-McKee gain no more. The published file gains from it as well ([speed.md](speed.md)); the scenes above are
+   too small for it.
 6. **Multigrid without small entries** (`-component_drop`, `-fs_drop`), which are added to the diagonal. In 2D there
    are too few for the copy to pay; matrices that would keep more than half of their entries stay as they are.
 7. **Fractures that open** (`-fs_fractures`). By the cubic law fractures conduct as the cube of their opening, which
