@@ -7,6 +7,7 @@ rank are provoked in this process.
 import importlib.util
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -24,6 +25,7 @@ from petsc_fs.cli.main import main, split_arguments
 from petsc_fs.errors import SceneError, UsageError
 from petsc_fs.io import hdf5
 from petsc_fs.io.bundled import check_targets, find_scene
+from petsc_fs.porepy.cases import describe_permeability
 from petsc_fs.scene import contact_state_counts
 
 MPIEXEC = Path(petsc_fs.__path__[0]).parent / "scripts" / "mpiexec"
@@ -333,6 +335,21 @@ def test_inspect_shows_fields_and_contact_states_once(tmp_path, ranks):
     assert done.stdout.count(f"contact states: {states}\n") == 1
     assert "kg = 1e+10" in done.stdout
     assert "porepy 1.11" in done.stdout
+    assert "fracture permeability: 1 m^2 as in the published code, not the cubic law\n" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("model", "words"),
+    [
+        ("model1", "not the cubic law"),
+        ("model2 (refinement=2, fracture_permeability=cubic)", r"the cubic law, aperture\^2"),
+        ("model1 (friction=0.1, physics=restricted)", "that of the rock"),
+        ("contact (refinement=2)|biot|mine", "^$"),
+    ],
+)
+def test_scenes_of_models_tell_the_permeability_of_fractures(model, words):
+    for name in model.split("|"):
+        assert re.search(words, describe_permeability(name))
 
 
 @pytest.mark.parametrize("words", [["inspect", "flow.h5"], ["solve", "flow.h5", "-ksp_monitor"], ["--help"]], ids=str)
@@ -431,12 +448,12 @@ needs_matplotlib = pytest.mark.skipif(importlib.util.find_spec("matplotlib") is 
 
 @needs_matplotlib
 def test_inspect_draws_a_picture(tmp_path):
-    done = run("inspect", "contact.h5", "--plot", "blocks.png", cwd=tmp_path)
+    done = run("inspect", "contact.h5", "--plot", "blocks.svg", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.endswith("block structure drawn in blocks.png\n")
-    picture = (tmp_path / "blocks.png").read_bytes()
-    assert picture[:8] == b"\x89PNG\r\n\x1a\n"
-    assert len(picture) > 10000
+    assert done.stdout.endswith("block structure drawn in blocks.svg\n")
+    texts = set(re.findall("<!-- (.*) -->", (tmp_path / "blocks.svg").read_text(encoding="utf-8")))
+    legend = {"empty", "block of $J$", "block that the step changes", "singular block", "entry of $J$"}
+    assert texts > legend | {"1 contact", "3 momentum", "$J_{23}$"}
 
 
 @needs_matplotlib

@@ -132,7 +132,7 @@ def test_ratios_are_medians_of_those_within_each_round() -> None:
 
 def assert_self_contained(text: str, pictures: int) -> None:
     """The page loads nothing but its pictures, and closes what it opens."""
-    body = re.sub("<style>.*?</style>", "", text, flags=re.DOTALL)
+    body = re.sub("<(style|script)>.*?</\\1>", "", text, flags=re.DOTALL)
     loaded = re.findall(r'<[^>]*(?:src|href|srcset|data|poster|action)="([^"]*)"', body)
     assert len(loaded) == pictures
     assert all(v.startswith("data:image/svg+xml;base64,") for v in loaded)
@@ -141,6 +141,11 @@ def assert_self_contained(text: str, pictures: int) -> None:
     assert all(tags[f"/{tag}"] == n for tag, n in tags.items() if tag[0] != "/" and tag not in ("meta", "img", "br"))
     style = text[text.index("<style>") : text.index("</style>")]
     assert "url(" not in style and "@import" not in style
+    # What a screen reader asks for
+    assert '<html lang="en">' in text and tags["main"] == tags["h1"] == 1
+    assert tags["table"] == tags["caption"] == len(re.findall('tabindex="0" aria-label="[^"]+"><table>', text)) > 0
+    assert len(re.findall('<th scope="(?:col|row)">', text)) == tags["th"] and '<th scope="col"></th>' not in text
+    assert len(re.findall('<img alt="[^"]{20,}"', text)) == pictures
 
 
 def test_page_is_whole_and_escapes_what_it_shows(tmp_path: Path) -> None:

@@ -2,12 +2,12 @@
 
 import argparse
 import io
+import json
 import lzma
 import subprocess
 import sys
 from contextlib import contextmanager
-from importlib.machinery import SourceFileLoader
-from importlib.util import module_from_spec, spec_from_loader
+from importlib import import_module
 from unittest.mock import patch
 
 import numpy as np
@@ -602,21 +602,34 @@ def test_every_solve_is_recorded(field_split_model, name):
         assert 0 < record.setup_seconds + record.solve_seconds <= record.seconds
 
 
-def test_iterations_and_contact_states_are_those_of_the_published_code(pp):
+def test_iterations_and_contact_states_are_those_of_the_published_code(pp, monkeypatch):
     """Each solve from the same contact states takes as many iterations, stopped as the published code stops."""
-    loader = SourceFileLoader("paper_tables", str(ROOT / "scripts" / "paper_tables"))
-    script = module_from_spec(spec_from_loader("paper_tables", loader))
-    loader.exec_module(script)
-    ours, unknowns, missed = script.history_of("model1_g1")
-    theirs = script.COUNTS["published_code"]["runs"]["model1_g1"]
-    assert (unknowns, missed, len(ours)) == (798, 0, len(theirs))
-    difference, alike = script.compare(ours, theirs)
-    assert difference <= 1
-    assert alike >= 18
-    assert [row[1:] for row in ours[0]] == [row[1:] for row in theirs[0]]
-    newton, krylov = np.subtract(script.means(ours), script.means(theirs))
+    monkeypatch.syspath_prepend(ROOT / "scripts")
+    page = import_module("page.paper_tables")
+    ours, theirs = page.make_run("model1_g1"), page.published("model1_g1")
+    assert (ours["unknowns"], ours["missed"], len(ours["history"])) == (798, 0, len(theirs["history"]))
+    alike = page.differences(ours, theirs)
+    assert max(alike) <= 1
+    assert len(alike) >= 18
+    assert [row[1:] for row in ours["history"][0]] == [row[1:] for row in theirs["history"][0]]
+    newton, krylov = np.subtract(page.means(ours), page.means(theirs))
     assert abs(newton) < 0.5 and abs(krylov) < 0.5
-    assert script.printed("model1_g1") == (3.5, pytest.approx(14.3))
+
+
+def test_richardson_takes_the_published_iterations_and_its_runs_are_kept(pp, monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "scripts")
+    page = import_module("page.paper_tables")
+    name = "richardson_Kn1.2e+09_F0.1"
+    ours = page.make_run(name)
+    alike = page.differences(ours, page.published(name))
+    assert max(alike) <= 1 and len(alike) == 13
+    assert page.means(ours) == pytest.approx((13 / 6, 17.2), abs=0.2)  # as the paper prints
+    assert page.shown(ours | {"history": ours["history"][:1]}).endswith("\\*")
+    assert page.shown(ours | {"failed": "time step 1"}) == "fails"
+    kept = json.loads((ROOT / "docs" / "paper_tables.json").read_text(encoding="utf-8"))
+    assert kept.keys() >= {n for n, run in page.RUNS.items() if run.steps == page.STEPS}  # of the others some may miss
+    assert [n for n, record in kept.items() if record["digest"] != page.RUNS[n].digest()] == []
+    assert max(page.differences(ours, kept[name])) <= 1
 
 
 def test_three_dimensions(field_split_model):

@@ -8,6 +8,8 @@ import pytest
 from blocks import blocks, run
 from programs import ENVIRONMENT, ROOT
 
+import petsc_fs.pc
+
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCKS = blocks(README)
 TO_RUN = [(info.removesuffix(" run"), text) for info, text in BLOCKS if info in ("bash run", "python run")]
@@ -45,6 +47,13 @@ def test_the_first_command_prints_what_is_said(folder):
     said = "\n".join(re.findall(r"^    .*$", README.split(TO_RUN[0][1])[1].split("## ")[0], re.MULTILINE))
     assert words(said) == words(printed)[: len(words(said))]
     assert len(words(printed)) <= len(words(said)) + 3
+    promised, found = (int(n) for text in (said, printed) for n in re.findall(r"(\d+) iterations", text))
+    assert abs(promised - found) <= 2
+
+
+def test_so_many_preconditioners_are_in_python():
+    numbers = {4: "four", 5: "five", 6: "six"}
+    assert f"{numbers[len(petsc_fs.pc.__all__)]} small Python PCs" in " ".join(README.split())
 
 
 def test_the_first_own_matrix_comes_soon():

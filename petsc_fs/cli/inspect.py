@@ -16,6 +16,7 @@ from petsc_fs.fields import learn_aliases
 from petsc_fs.io import hdf5, sequence
 from petsc_fs.io.bundled import check_targets, find_scene
 from petsc_fs.io.files import write_text
+from petsc_fs.porepy.cases import describe_permeability
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -70,6 +71,8 @@ def _lines(args: argparse.Namespace) -> list[str]:
         return [contents_table(path.name, sequence.read_contents(path))]
     scene = sequence.read(path, args.step) if many else hdf5.read(path)
     lines = [scene_table(scene)]
+    if permeability := describe_permeability(scene.metadata.model):
+        lines.append(f"fracture permeability: {permeability}")
     if args.contraction:
         from petsc_fs.tools import contraction
 

@@ -32,6 +32,11 @@ Physics = Literal["full", "restricted"]
 FracturePermeability = Literal["unit", "cubic", "constant"]
 PHYSICS = get_args(Physics)
 FRACTURE_PERMEABILITY = get_args(FracturePermeability)
+PERMEABILITY_WORDS = {
+    "unit": "1 m^2 as in the published code, not the cubic law",
+    "cubic": "the cubic law, aperture^2 / 12",
+    "constant": "that of the rock",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,3 +240,13 @@ def find_case(name: str) -> Case:
     if name not in CASES:
         raise UsageError(f"unknown model {name!r}; models are {', '.join(CASES)}")
     return CASES[name]
+
+
+def describe_permeability(scene_name: str) -> str:
+    """Permeability of the fractures in a scene of one of the models, by the name that it has; "" for other scenes."""
+    name, _, changes = scene_name.partition(" (")
+    case = CASES.get(name)
+    if case is None or not case.fractures or case.equations == "mechanics":
+        return ""
+    kinds = [kind for kind in FRACTURE_PERMEABILITY if f"fracture_permeability={kind}" in changes]
+    return PERMEABILITY_WORDS["constant" if "restricted" in changes else (*kinds, case.fracture_permeability)[0]]

@@ -31,7 +31,7 @@ from petsc_fs.errors import UsageError
 from petsc_fs.io.files import write_text
 from petsc_fs.tools import measure
 from petsc_fs.tools.measure import CLOCKS, Job, Record, Variant, grown, positive, say, seconds_of
-from petsc_fs.tools.pages import hypertext
+from petsc_fs.tools.pages import hypertext, whole
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -222,7 +222,7 @@ def summary(found: Comparison, everything: Sequence[Point]) -> list[list[object]
 
 
 SUMMARY = ("scene", "ranks", "error ≤", *SECONDS.values())
-MEDIANS = "file;ranks;tolerance;iterations;true residual;forward error;set-up (s);solve (s);".split(";")
+MEDIANS = "file;ranks;tolerance;iterations;true residual;forward error;set-up (s);solve (s);outcome".split(";")
 RATIOS = "scene;ranks;file;Krylov;set-up, s;solve, s;set-up ratio;solve ratio;ratio;MiB".split(";")
 FAILURES = "scene;file;ranks;outcome;runs;said".split(";")
 
@@ -295,14 +295,6 @@ def to_csv(found: Comparison) -> str:
 
 # --- the page
 
-STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; color: #1a1a1a; max-width: 68rem; margin: 2rem auto; padding: 0 1rem; }
-table { border-collapse: collapse; margin: .6rem 0 1rem; font-variant-numeric: tabular-nums; font-size: .92rem; }
-th, td { text-align: left; padding: .25rem .7rem; border-bottom: 1px solid #ddd; vertical-align: top; }
-td.n { text-align: right; white-space: nowrap; } img { max-width: 100%; } h2 { border-bottom: 2px solid #0072B2; }
-pre { background: #f5f5f5; padding: .7rem; overflow-x: auto; font-size: .82rem; }
-"""
-
 METHOD = """\
 Each combination of scene, file and number of ranks ran in a process of its own in each round; all combinations came to
 their turn before any did again, in another order each time. A first set-up and solve in each process is not counted.
@@ -317,30 +309,28 @@ not decide."""
 
 def page(found: Comparison, everything: Sequence[Point], pictures: Mapping[str, Path]) -> str:
     """The page: summary, pictures by label of the scene, and how it was measured; it refers to no other file."""
-    title = escape(f"Comparison: {', '.join(case.label for case in found.cases)}")
-    lines = [
-        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>',
-        f"<style>{STYLE}</style></head><body><h1>{title}</h1>",
-    ]
+    lines: list[str] = []
     if not found.about["complete"]:
         lines.append("<p><b>Measuring was interrupted:</b> later rounds or combinations are missing.</p>")
     if found.base:
-        lines += [f"<h2>Against {escape(found.base)}</h2>", hypertext(RATIOS, ratio_rows(found, everything))]
+        rows = ratio_rows(found, everything)
+        lines += [f"<h2>Against {escape(found.base)}</h2>", hypertext("Ratios of seconds", RATIOS, rows)]
     if best := summary(found, everything):
-        lines += ["<h2>Which file is fastest for which accuracy</h2>", hypertext(SUMMARY, best)]
+        lines += ["<h2>Which file is fastest for which accuracy</h2>", hypertext("Fastest files", SUMMARY, best)]
     for case in found.cases:
         lines += _about_case(case, [p for p in everything if p.scene == case.label], pictures.get(case.label))
     failed = failures(found)
     lines.append("<h2>What did not converge</h2>")
-    lines.append(hypertext(FAILURES, failed) if failed else "<p>Every solve met its tolerance.</p>")
+    lines.append(hypertext("Failures", FAILURES, failed) if failed else "<p>Every solve met its tolerance.</p>")
     facts = [[k, f"{v:.3g}" if isinstance(v, float) else v] for k, v in found.about.items()]
     facts.append(["seconds are", f"{CLOCKS[found.clock]} of the slowest rank"])
-    lines += ["<h2>How this was measured</h2>", f"<p>{METHOD}</p>", hypertext(("", ""), facts)]
+    how = hypertext("Machine, versions and call", ("what", "value"), facts)
+    lines += ["<h2>How this was measured</h2>", f"<p>{METHOD}</p>", how]
     for variant in found.variants:
         more = "".join(f"-{k} {v or ''}\n" for k, v in variant.options.items())
         head = f"<code>{escape(variant.label)}</code>: {escape(variant.purpose)}"
-        lines.append(f"<details><summary>{head}</summary><pre>{escape(more + variant.text)}</pre></details>")
-    return "\n".join([*lines, "</body></html>"]) + "\n"
+        lines.append(f"<details><summary>{head}</summary><pre tabindex=0>{escape(more + variant.text)}</pre></details>")
+    return whole(f"Comparison: {', '.join(case.label for case in found.cases)}", lines)
 
 
 def _about_case(case: Case, mine: Sequence[Point], picture: Path | None) -> Iterator[str]:
@@ -351,7 +341,8 @@ def _about_case(case: Case, mine: Sequence[Point], picture: Path | None) -> Iter
     yield from (f"<h2>{escape(case.label)}</h2>", f"<p>{escape(about)}</p>")
     if picture is not None:
         data = base64.b64encode(picture.read_bytes()).decode("ascii")
-        yield f'<img alt="Error against seconds" src="data:image/svg+xml;base64,{data}">'
+        alt = f"Error against seconds on {escape(case.label)}, a curve for each options file; its numbers are below"
+        yield f'<img alt="{alt}" src="data:image/svg+xml;base64,{data}">'
     if case.reference:
         words = f"{case.reference['method']}; last correction {case.reference['corrections'][-1]:.0e}, "
         words += f"componentwise backward error {case.reference['backward_error']['componentwise']:.0e}"
@@ -364,7 +355,7 @@ def _about_case(case: Case, mine: Sequence[Point], picture: Path | None) -> Iter
         )
         for p in mine
     ]
-    yield f"<details><summary>All medians</summary>{hypertext(MEDIANS, rows)}</details>"
+    yield f"<details><summary>All medians</summary>{hypertext(f'Medians on {case.label}', MEDIANS, rows)}</details>"
 
 
 def draw(found: Comparison, everything: Sequence[Point], out: Path) -> dict[str, Path]:

@@ -17,7 +17,8 @@ steps of a sequence where that makes sense, the worst of them else:
     iterations         of the outer Krylov method
     reason             PETSc's name for why it stopped, for example "CONVERGED_RTOL"
     tolerance          what the true residual was held against
-    seconds            {"read": ..., "setup": ..., "solve": ...}, by the clock; set-up is one for all tolerances
+    seconds            {"read": ..., "build": ..., "setup": ..., "solve": ...}, by the clock; set-up, of which building
+                       PETSc's matrices is a part, is one for all tolerances
     cpu_seconds        the same of the processor: less noisy where others compute, too
     true_residual      |b - J x| / |b| of the user's system
     residual_by_field  |r_f| / |b| of each field
@@ -103,7 +104,7 @@ SIGNAL = re.compile(r"exited on signal (\d+)|Caught signal number (\d+)|\(signal
 
 
 def seconds_of(record: Record, clock: str = "wall") -> dict[str, float]:
-    """Seconds of a record by phase: "read", "setup" and "solve"; and "total", of the last two."""
+    """Seconds of a record by phase: "read", "build", "setup" and "solve"; and "total", of the last two."""
     found = record["seconds" if clock == "wall" else "cpu_seconds"]
     return {**found, "total": found["setup"] + found["solve"]}
 

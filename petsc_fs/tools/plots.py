@@ -38,22 +38,26 @@ def pyplot() -> Any:
 def plot_blocks(scene: Scene, path: str | os.PathLike[str]) -> Path:
     """Draw the block structure of a whole Jacobian, and above it what each level eliminates, as the paper does.
 
-    Above, one small grid per stage: white blocks are empty, light ones those of the Jacobian, dark ones
-    changed by the transformation or by a Schur complement, `S` a singular diagonal block. Below, the
-    entries of the Jacobian itself.
+    Above, one small grid per stage, with the paper's numbers of the fields; the legend says what shades and `S` mean.
+    Below, the entries of the Jacobian itself.
     """
     plt = pyplot()
+    from matplotlib.patches import Patch
+
     names, n, steps = scene.fields, len(scene.fields), stages(scene)
-    figure = plt.figure(figsize=(max(1.5 * n + 1.8, 2.0 * len(steps)), 1.5 * n + 3.4), layout="constrained")
-    grid = figure.add_gridspec(2, len(steps), height_ratios=(1, 4))
+    numbers = [FIELD[name].index for name in names]
+    figure = plt.figure(figsize=(max(1.2 * n + 1.8, 6.4), 1.2 * n + 4.0), layout="constrained")
+    grid = figure.add_gridspec(2, len(steps), height_ratios=(1.4, max(n, 2)))
     for k, (title, shades) in enumerate(steps):
         small = figure.add_subplot(grid[0, k])
         _draw_shades(small, names, shades, 0.6)
         for (r, c), shade in shades.items():
             if shade == "singular":
-                small.text(names.index(c) + 0.5, names.index(r) + 0.5, "S", ha="center", va="center", fontsize=8)
-        small.set(xticks=[], yticks=[])
-        small.set_title(title, fontsize=9)
+                small.text(names.index(c) + 0.5, names.index(r) + 0.55, "S", ha="center", va="center")
+        small.set_xticks(np.arange(n) + 0.5, numbers)
+        small.set_yticks(np.arange(n) + 0.5, numbers)
+        small.tick_params(length=0, pad=1)
+        small.set_title(title, fontsize=11)
     axes = figure.add_subplot(grid[1, :])
     full = {rc: block for rc, block in scene.blocks.items() if block.data.size}
     _draw_shades(axes, names, dict.fromkeys(full, "original"), 0.8)
@@ -65,13 +69,19 @@ def plot_blocks(scene: Scene, path: str | os.PathLike[str]) -> Path:
         axes.plot(x, y, ",", color="#1f4e79", rasterized=True)
         box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.85}
         label = f"$J_{{{FIELD[r].index}{FIELD[c].index}}}$"
-        axes.text(j + 0.5, i + 0.5, label, ha="center", va="center", fontsize=11, bbox=box)
-    axes.set_xticks(np.arange(n) + 0.5, [f"{f}\n{scene.sizes[f]:,}" for f in names], fontsize=9)
-    axes.set_yticks(np.arange(n) + 0.5, names, fontsize=9)
+        axes.text(j + 0.5, i + 0.5, label, ha="center", va="center", fontsize=13, bbox=box)
+    labels = [f"{number} {name}" for number, name in zip(numbers, names, strict=True)]
+    axes.set_xticks(np.arange(n) + 0.5, [f"{f}\n{scene.sizes[f]:,}" for f in names], fontsize=11)
+    axes.set_yticks(np.arange(n) + 0.5, labels, fontsize=11)
     axes.tick_params(length=0)
     axes.xaxis.tick_top()
-    axes.set(xlabel="unknowns (columns)", ylabel="equations (rows)")
-    figure.suptitle(f"{scene.metadata.model or 'scene'}: {sum(scene.sizes.values()):,} unknowns", fontsize=11)
+    axes.set_xlabel("rows are equations, columns unknowns, with their number above", fontsize=11)
+    words = {"white": "empty", SHADES["original"]: "block of $J$", SHADES["changed"]: "block that the step changes"}
+    handles = [Patch(facecolor=colour, edgecolor="#444444", label=text) for colour, text in words.items()]
+    handles += [plt.Line2D([], [], ls="", marker=r"$\mathrm{S}$", markersize=9, color="black", label="singular block")]
+    handles += [plt.Line2D([], [], ls="", marker=".", color="#1f4e79", label="entry of $J$")]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=11)
+    figure.suptitle(f"{scene.metadata.model or 'scene'}: {sum(scene.sizes.values()):,} unknowns", fontsize=12)
     return _save(figure, Path(path))
 
 
@@ -148,11 +158,12 @@ def plot_contact_states(
 ) -> Path:
     """Draw the number of sticking, sliding and open fracture cells over the Newton steps of a run, as the paper does.
 
-    Shaded and white backgrounds tell the time steps apart; the axis above says when they end. To the right, if
-    they are known, the fracture cells in their places.
+    Shaded and white backgrounds tell the time steps apart; the axis above says when they end. Below, the iterations of
+    each linear solve, and, if they are known, the fracture cells in their places.
 
     Args:
-        records: one per Newton step, with `time_step`, `time` in s, and `contact_states`, name to number of cells.
+        records: one per Newton step, with `time_step`, `time` in s, `iterations`, and `contact_states`, name to number
+            of cells.
         path: of the picture.
         title: above the picture.
         cells: centres (n, 3) of the fracture cells in m, and their states as in `Scene.contact_state`.
@@ -164,26 +175,33 @@ def plot_contact_states(
     shown = [record for record in records if record["contact_states"]]
     if not shown:
         raise UsageError(f"{path}: no contact states to draw")
-    figure = plt.figure(figsize=(7.2 if cells is None else 10.2, 3.6), layout="constrained")
-    grid = figure.add_gridspec(1, 1 if cells is None else 2, width_ratios=None if cells is None else (2, 1))
-    axes = figure.add_subplot(grid[0, 0])
+    heights = (3.0, 1.4) if cells is None else (3.0, 1.4, 3.4)
+    figure = plt.figure(figsize=(6.4, 1.4 + sum(heights)), layout="constrained")
+    grid = figure.add_gridspec(len(heights), 1, height_ratios=heights)
+    axes = figure.add_subplot(grid[0])
+    below = figure.add_subplot(grid[1], sharex=axes)
     if cells is not None:
-        _draw_cells(figure, grid[0, 1], *cells)
+        _draw_cells(figure, grid[2], *cells)
+    steps = np.arange(1, len(shown) + 1)
     for state, (color, line, marker) in STATES.items():
         counts = [record["contact_states"].get(state, 0) for record in shown]
         style = {"color": color, "marker": marker, "markersize": 4, "lw": 1.6, "clip_on": False}
-        axes.plot(np.arange(1, len(shown) + 1), counts, line, label=state, **style)
+        axes.plot(steps, counts, line, label=state, **style)
+    below.plot(steps, [record["iterations"] for record in shown], ".-", color="black", lw=1)
     # A time step that is tried again with a shorter length counts as one more.
     attempts = [(record["time_step"], record["time"]) for record in shown]
     starts = [i for i, attempt in enumerate(attempts) if i == 0 or attempt != attempts[i - 1]]
     ends = [*starts[1:], len(shown)]
     for start, end in list(zip(starts, ends, strict=True))[::2]:
-        axes.axvspan(start + 0.5, end + 0.5, color="#ececec", lw=0, zorder=0)
-    most = max(sum(record["contact_states"].values()) for record in shown)
-    axes.set(xlim=(0.5, len(shown) + 0.5), ylim=(0, 1.05 * most))
-    for axis in (axes.xaxis, axes.yaxis):
+        for each in (axes, below):
+            each.axvspan(start + 0.5, end + 0.5, color="#e4e4e4", lw=0, zorder=0)
+    axes.set(xlim=(0.5, len(shown) + 0.5), ylim=(0, 1.05 * max(sum(r["contact_states"].values()) for r in shown)))
+    below.set_ylim(bottom=0)
+    axes.tick_params(labelbottom=False)
+    for axis in (axes.xaxis, axes.yaxis, below.yaxis):
         axis.get_major_locator().set_params(integer=True)
-    axes.set(xlabel="Newton steps from the start (–)", ylabel="fracture cells (–)")
+    axes.set_ylabel("fracture cells")
+    below.set(xlabel="Newton steps from the start", ylabel="iterations")
     times = [shown[start]["time"] for start in starts]
     unit = next(name for name, length in TIME_UNITS.items() if times[-1] >= length or length == 1.0)
     above = axes.secondary_xaxis("top")
@@ -198,18 +216,18 @@ def plot_contact_states(
 
 def _draw_cells(figure: Any, place: Any, centers: Floats, states: Integers) -> None:
     """Fracture cells in their places, by contact state; in 2D seen from above."""
-    flat = np.ptp(centers[:, 2]) == 0
+    flat = np.ptp(centers[:, 2]) <= 1e-9 * np.ptp(centers)  # but for rounding
     axes = figure.add_subplot(place, projection=None if flat else "3d")
     for number, state in enumerate(CONTACT_STATES):
         color, _, marker = STATES[state]
         at = centers[states == number].T / 1000
-        axes.scatter(*(at[:2] if flat else at), color=color, marker=marker, s=14)
+        axes.scatter(*(at[:2] if flat else at), color=color, marker=marker, s=20)
     axes.set(aspect="equal", xlabel="x (km)", ylabel="y (km)")
     axes.set_title("at the last Newton step", fontsize=10)
     if not flat:
         axes.set_zlabel("z (km)")
-        axes.locator_params(nbins=3)
-        axes.set_box_aspect(axes.get_box_aspect(), zoom=0.8)  # room for it
+        axes.locator_params(nbins=4)
+        axes.set_box_aspect(axes.get_box_aspect(), zoom=0.95)  # room for it
 
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -217,8 +235,8 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 DASHES = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (6, 1.5, 1.2, 1.5)), (0, (3, 1)))
 OUTCOME_COLOURS = {"right": "#0072B2", "refusal": "#F0E442", "wrong": "#D55E00", "hang": "#CC79A7", "crash": "#000000"}
-MARKS = {"refusal": "–", "wrong": "×", "hang": "∞", "crash": "!"}
-"""What stands in a field of the matrix, for whom colours are not enough."""
+MARKS = {"refusal": "", "wrong": " ×", "hang": " ∞", "crash": " !"}
+"""What stands behind the number in a field of the matrix, for whom colours are not enough."""
 
 
 def look(number: int) -> dict[str, Any]:
@@ -233,7 +251,7 @@ def plot_work_precision(
     title: str,
     seconds: str,
 ) -> Path:
-    """Draw error against seconds, a panel each for what counts as seconds.
+    """Draw error against seconds, a panel each for what counts as seconds, one above the other.
 
     Args:
         curves: title of a panel to label to points, seconds and error.
@@ -242,56 +260,77 @@ def plot_work_precision(
         seconds: what they are, for the axes.
     """
     plt = pyplot()
-    figure, panels = plt.subplots(1, len(curves), figsize=(9.2, 4.6), sharey=True, squeeze=False, layout="constrained")
     labels = list(dict.fromkeys(label for panel in curves.values() for label in panel))
-    for axes, (heading, panel) in zip(panels[0], curves.items(), strict=True):
+    columns = max(1, min(len(labels), int(60 / max(map(len, labels), default=1))))
+    size = (6.4, 3.6 * len(curves) + 0.25 * -(-len(labels) // columns))
+    figure, panels = plt.subplots(len(curves), 1, figsize=size, sharex=True, squeeze=False, layout="constrained")
+    for axes, (heading, panel) in zip(panels[:, 0], curves.items(), strict=True):
         for label, points in panel.items():
             x, y = zip(*points, strict=True)
             axes.plot(x, np.maximum(y, 1e-17), label=label, **look(labels.index(label)))
-        axes.set(xscale="log", yscale="log", xlabel=f"seconds ({seconds})")
-        axes.set_title(heading, loc="left", fontsize=10)
+        axes.set(xscale="log", yscale="log", ylabel="forward error, all fields")
+        axes.set_title(heading, loc="left", fontsize=11)
         axes.grid(color="#DDDDDD")
-    panels[0][0].set_ylabel("forward error, all fields (1)")
-    figure.suptitle(title, fontsize=11)
-    handles, names = panels[0][0].get_legend_handles_labels()
-    columns = max(1, min(len(names), int(100 / max(map(len, names), default=1))))
-    figure.legend(handles, names, loc="outside lower center", ncols=columns, frameon=False, fontsize=8)
+    panels[-1, 0].set_xlabel(f"seconds ({seconds})")
+    _plain(panels[-1, 0].xaxis)
+    figure.suptitle(title, fontsize=12)
+    handles, names = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=columns, frameon=False)
     return _save(figure, Path(path))
+
+
+def _plain(axis: Any) -> None:
+    """Give a logarithmic axis plain numbers, 1, 2 and 5 of each decade where there are few."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 1e3 * low else (1,)))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
 
 
 def plot_matrix(
     cases: Sequence[Mapping[str, Any]], findings: Sequence[Mapping[str, Any]], outcomes: Sequence[str], path: Path
 ) -> Path:
-    """Draw outcomes: a row for each case under its group, a column for each options file and number of ranks."""
+    """Draw outcomes: a row for each options file, a column for each group of cases.
+
+    A field has the colour of the worst outcome, and the number of cases that end so on some number of ranks.
+    """
     plt = pyplot()
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
-    columns = list(dict.fromkeys((f["file"], f["ranks"]) for f in findings))
-    rows: list[str] = []
-    for group in dict.fromkeys(case["group"] for case in cases):
-        rows += [f"[{group}]", *(case["name"] for case in cases if case["group"] == group)]
-    grid = np.full((len(rows), len(columns)), np.nan)
-    figure, axes = plt.subplots(figsize=(3.2 + 0.2 * len(columns), 3.0 + 0.145 * len(rows)), layout="constrained")
+    group_of = {case["name"]: case["group"] for case in cases}
+    groups, files = list(dict.fromkeys(group_of.values())), list(dict.fromkeys(f["file"] for f in findings))
+    fields: dict[tuple[int, int], dict[str, int]] = {}  # to the worst outcome of each case
     for f in findings:
-        i, j = rows.index(f["case"]), columns.index((f["file"], f["ranks"]))
-        grid[i, j] = outcomes.index(f["outcome"])
-        colour = "black" if f["outcome"] == "refusal" else "white"
-        axes.text(j, i, MARKS.get(f["outcome"], ""), ha="center", va="center", fontsize=7, color=colour)
+        worst = fields.setdefault((files.index(f["file"]), groups.index(group_of[f["case"]])), {})
+        worst[f["case"]] = max(worst.get(f["case"], 0), outcomes.index(f["outcome"]))
+    grid = np.full((len(files), len(groups)), np.nan)
+    figure, axes = plt.subplots(figsize=(6, 2.2 + 0.2 * len(files)), layout="constrained")
+    for (i, j), worst in fields.items():
+        grid[i, j] = number = max(worst.values())
+        name, count = outcomes[number], list(worst.values()).count(number)
+        text = f"{count}{MARKS[name]}" if name in MARKS else ""
+        colour = "black" if name == "refusal" else "white"
+        axes.text(j, i, text, ha="center", va="center_baseline", fontsize=9, color=colour)
     shades = ListedColormap([OUTCOME_COLOURS[name] for name in outcomes])
     axes.imshow(grid, cmap=shades, vmin=-0.5, vmax=len(outcomes) - 0.5, aspect="auto", interpolation="none")
-    axes.set_yticks(range(len(rows)), rows, fontsize=8)
-    names = [f"{file.removesuffix('.opts')}, {n}" for file, n in columns]
-    axes.set_xticks(range(len(columns)), names, rotation=90, fontsize=7)
+    axes.set_yticks(range(len(files)), [file.removesuffix(".opts") for file in files], fontsize=9)
+    sizes = [f"{group}, {list(group_of.values()).count(group)}" for group in groups]
+    axes.set_xticks(range(len(groups)), sizes, rotation=35, ha="left", rotation_mode="anchor", fontsize=9)
     axes.xaxis.tick_top()
     axes.tick_params(length=0)
-    axes.set_xlabel("options file, ranks")
-    axes.set_xticks(np.arange(1, len(columns)) - 0.5, minor=True)
-    axes.set_yticks(np.arange(1, len(rows)) - 0.5, minor=True)
-    axes.grid(which="minor", color="white", linewidth=0.6)
-    handles = [Patch(facecolor=OUTCOME_COLOURS[name], label=f"{name} {MARKS.get(name, '')}") for name in outcomes]
+    axes.set_xlabel("what makes cases hard, and their number", fontsize=9)
+    axes.xaxis.set_label_position("top")
+    axes.set_xticks(np.arange(1, len(groups)) - 0.5, minor=True)
+    axes.set_yticks(np.arange(1, len(files)) - 0.5, minor=True)
+    axes.grid(which="minor", color="white", linewidth=1)
+    ends = {"right": "all right", "refusal": "so many refused"}
+    shown = [name for k, name in enumerate(outcomes) if name in ends or (grid == k).any()]
+    handles = [Patch(facecolor=OUTCOME_COLOURS[n], label=ends.get(n, f"so many: {n}{MARKS.get(n)}")) for n in shown]
     handles.append(Patch(facecolor="white", edgecolor="grey", label="not for these fields"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=9, frameon=False)
     return _save(figure, path)
 
 
@@ -306,7 +345,7 @@ def plot_front(
         title: above the picture.
         path: of it.
     """
-    figure, axes = pyplot().subplots(figsize=(6, 4.6), layout="constrained")
+    figure, axes = pyplot().subplots(figsize=(6.4, 5.2), layout="constrained")
     for k, (name, points) in enumerate(groups.items()):
         style = look(k) | {"linestyle": "none", "markersize": 4 + 3 * k, "alpha": 0.8}
         axes.plot(*np.reshape(points, (-1, 2)).T, label=f"{name} ({len(points)})", **style)
@@ -315,7 +354,8 @@ def plot_front(
         axes.set(**{f"{axis}label": f"{name} / {name} of the base file"})
         if max(values) > 10 * min(values):
             axes.set(**{f"{axis}scale": "log"})
-    axes.set_title(title, fontsize=10)
+            _plain(getattr(axes, f"{axis}axis"))
+    axes.set_title(title, fontsize=11)
     axes.grid(color="#DDDDDD")
-    axes.legend(fontsize=8)
+    axes.legend()
     return _save(figure, path)

@@ -195,11 +195,12 @@ class Probe:
         solved: list[tuple[int, Any]] = []
         for k, (scene, layout, forcing) in enumerate(steps):
             self.log.phase("set-up", repetition=max(repetition, 0), rtol=self.rtols[0])
-            solver, setup = self._timed(partial(self._set_up, scene, layout))
+            solver, build = self._timed(partial(self._build, scene, layout))
+            _, rest = self._timed(solver.set_up)
             for rtol in rtols:
                 self.log.phase("solve", rtol=rtol)
                 result, solve = self._timed(partial(solver.solve, forcing if rtol is None else rtol))
-                sums[rtol] = _worst(sums[rtol], self._describe(result, setup, solve))
+                sums[rtol] = _worst(sums[rtol], self._describe(result, build, rest, solve))
                 if repetition < 0 or k + 1 < len(steps):
                     continue
                 useless = self._useless()
@@ -213,8 +214,8 @@ class Probe:
             self._compute_errors(solved)
         return True
 
-    def _set_up(self, scene: Scene, layout: Layout) -> Solver:
-        """A solver that is set up: the last step's, updated, where fields have the same sizes. Collective."""
+    def _build(self, scene: Scene, layout: Layout) -> Solver:
+        """A solver with its matrices: the last step's, updated, where fields have the same sizes. Collective."""
         from petsc_fs.solver import Solver
 
         if self.solver is not None and _sizes(self.solver.layout) == _sizes(layout):
@@ -222,7 +223,6 @@ class Probe:
         else:
             self._forget()
             self.solver = Solver(replace(scene), self.comm, layout=layout)
-        self.solver.set_up()
         return self.solver
 
     def _forget(self) -> None:
@@ -230,11 +230,11 @@ class Probe:
             self.solver.destroy()
             self.solver = None
 
-    def _describe(self, result: Result, setup: tuple[float, float], solve: tuple[float, float]) -> Record:
-        """The record of one solve. Collective."""
+    def _describe(self, result: Result, *phases: tuple[float, float]) -> Record:
+        """The record of one solve, by the seconds of building, of the rest of set-up and of the solve. Collective."""
         seconds = [
-            dict(zip(("read", "setup", "solve"), s, strict=True))
-            for s in zip(self.read_seconds, setup, solve, strict=True)
+            {"read": read, "build": build, "setup": build + rest, "solve": solve}
+            for read, build, rest, solve in zip(self.read_seconds, *phases, strict=True)
         ]
         return {
             "kind": verdict(result),
@@ -304,7 +304,7 @@ def _worst(before: Record, now: Record) -> Record:
     found = dict(max((before, now), key=lambda r: (r["kind"] != "converged", r["true_residual"])))
     found["iterations"] = before["iterations"] + now["iterations"]
     for clock in ("seconds", "cpu_seconds"):
-        found[clock] = now[clock] | {k: before[clock][k] + now[clock][k] for k in ("setup", "solve")}
+        found[clock] = now[clock] | {k: before[clock][k] + now[clock][k] for k in ("build", "setup", "solve")}
     return found | {"peak_rss": now["peak_rss"]}
 
 
