@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,8 +92,10 @@ class Refinement:
         is_determined: whether the equations determine the solution to `DETERMINED`.
     """
 
-    def __init__(self, system: System, ksp: PETSc.KSP, rtol: float, atol: float) -> None:
-        self.system, self.ksp, self.rtol = system, ksp, rtol
+    def __init__(
+        self, system: System, ksp: PETSc.KSP, rtol: float, atol: float, rounding: Mapping[str, float] | None = None
+    ) -> None:
+        self.system, self.ksp, self.rtol, self._rounding = system, ksp, rtol, rounding or {}
         self.x, self.r, self.d = (system.b.duplicate() for _ in range(3))
         self.max_it = int(ksp.getTolerances()[3])
         self.passes: list[int] = []  # iterations of each
@@ -223,7 +226,7 @@ class Refinement:
         if self.missing > 1.0 or not (self.passes and self.is_determined):
             return
         self._precondition()
-        found = math.ldexp(self.d.norm(), -self.system.rhs_scale) / math.sqrt(self.d.getSize() or 1)
+        found = float(np.ldexp(self.d.norm(), -self.system.rhs_scale)) / math.sqrt(self.d.getSize() or 1)
         if found > error and self.iterations < self.max_it:
             self._pass(max(error / found, LEAST_RTOL))
             self._take_step()
@@ -269,9 +272,15 @@ class Refinement:
         return relative if solved else None
 
     def _relative(self, part: PETSc.Vec) -> dict[str, float]:
-        """Size of each field of a vector beside that of the solution, or beside what would change any equation."""
+        """Size of each field of a vector beside that of the solution, or beside what would change any equation.
+
+        What is known to be rounding is as small as `DETERMINED` of that.
+        """
         sizes, found = self.system.norms(self.system.by_field(self.x), self.system.by_field(part))
         least = self.system.least_sizes(self.check, self.field_goal)
+        with np.errstate(over="ignore"):
+            for f, size in self._rounding.items():
+                least[f] = max(least[f], float(np.ldexp(size / DETERMINED, self.system.rhs_scale)))
         return {f: n / (max(sizes[f], least[f]) or 1.0) for f, n in found.items()}
 
     def _pass(self, rtol: float, max_it: int = 0) -> None:

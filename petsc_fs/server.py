@@ -238,18 +238,16 @@ class ServedSolver:
             self._client.call("update", self._handle, load=scene)
         self.transfer_seconds = time.perf_counter() - started
 
-    def solve(self, rtol: float | None = None, *, error: float = math.inf) -> Result:
-        """Solve; see `petsc_fs.solver.Solver.solve`.
-
-        Args:
-            rtol: relative tolerance of this solve.
-            error: that the solution should have at most.
+    def solve(
+        self, rtol: float | None = None, *, error: float = math.inf, rounding: Mapping[str, float] | None = None
+    ) -> Result:
+        """Solve; see `petsc_fs.solver.Solver.solve`, also for the arguments.
 
         Returns:
             What the solve did; `solution` has all rows of each field in the scene's numbering.
         """
         result: Result
-        result, solution, seconds = self._client.call("solve", self._handle, rtol, error)
+        result, solution, seconds = self._client.call("solve", self._handle, rtol, error, rounding)
         self.transfer_seconds += seconds
         return replace(result, solution=solution)
 
@@ -357,14 +355,16 @@ class _Rank:
         if self._kept[handle] is not None:
             self._kept[handle].update(scene)
 
-    def solve(self, handle: int, rtol: float | None, error: float) -> tuple[Result, Any, float] | None:
+    def solve(
+        self, handle: int, rtol: float | None, error: float, rounding: Mapping[str, float] | None
+    ) -> tuple[Result, Any, float] | None:
         """What the solve did; on rank 0 all of the solution; seconds it took to come. None on ranks without a part."""
         if handle not in self._kept:
             raise SolveError("there is nothing to solve: an earlier error left no system")
         solver = self._kept[handle]
         if solver is None:
             return None
-        result = solver.solve(rtol, error=error)
+        result = solver.solve(rtol, error=error, rounding=rounding)
         started = time.perf_counter()
         return result, solver.system.gather(result.solution), time.perf_counter() - started
 

@@ -209,6 +209,7 @@ class Solver:
         rhs: Mapping[str, NDArray[np.float64]] | None = None,
         *,
         error: float = math.inf,
+        rounding: Mapping[str, float] | None = None,
     ) -> Result:
         """Solve for the right-hand side of the scene, from a zero initial guess. Collective.
 
@@ -221,6 +222,8 @@ class Solver:
             rhs: another right-hand side for the same matrix, given as that of the scene was; kept for further solves.
             error: root mean square over all unknowns that the error of the solution should have at most; where the
                 tolerances leave more of it, by estimate, there is another correction. That decides nothing.
+            rounding: norm of each field up to which an error is none, as when the solution is added to something that
+                is so much larger; of fields that are missing, 0.
 
         Raises:
             SolveError: PETSc failed on the way, or the solution is not finite.
@@ -231,7 +234,7 @@ class Solver:
         file = PETSc.Options(self.prefix).getString("petsc_fs_retry", "none")
         first: Result | SolveError | SceneError
         try:
-            first = self._first(wanted, error)
+            first = self._first(wanted, error, rounding)
         except (SolveError, SceneError) as e:
             if file == "none":
                 raise
@@ -246,18 +249,20 @@ class Solver:
         self._built_seconds = 0.0
         return result
 
-    def _first(self, wanted: float, error: float) -> Result:
+    def _first(self, wanted: float, error: float, rounding: Mapping[str, float] | None) -> Result:
         """By the options of this solver. Collective."""
         self.set_up()
         with self._options():
-            result = self._run(self.ksp, wanted, error)
+            result = self._run(self.ksp, wanted, error, rounding)
             return result if result.converged else self._look_for_null_vectors(result, wanted)
 
-    def _run(self, ksp: PETSc.KSP, wanted: float, error: float = math.inf) -> Result:
+    def _run(
+        self, ksp: PETSc.KSP, wanted: float, error: float = math.inf, rounding: Mapping[str, float] | None = None
+    ) -> Result:
         """The Krylov method and its corrections, and what comes of them. Collective."""
         started = time.perf_counter()
         system = self.system
-        run = Refinement(system, ksp, wanted, self._atol if self._atol > PETSC_ATOL else 0.0)
+        run = Refinement(system, ksp, wanted, self._atol if self._atol > PETSC_ATOL else 0.0, rounding)
         try:
             run.first()
             run.correct()

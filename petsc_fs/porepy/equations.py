@@ -24,12 +24,10 @@ from petsc_fs.server import Client
 require_porepy()
 
 import porepy as pp  # noqa: E402
-from porepy.numerics.ad._ad_utils import (  # noqa: E402
-    MergedOperator,
-    discretize_from_list,
-    uniquify_discretization_list,
-)
 from scipy.sparse import vstack  # noqa: E402
+
+AD_UTILS = pp.ad.ad_utils if hasattr(pp.ad, "ad_utils") else pp.ad._ad_utils  # after, and up to PorePy 1.11
+MergedOperator = AD_UTILS.MergedOperator
 
 Floats = NDArray[np.float64]
 OF_GRIDS = {getattr(pp.ad, name) for name in ("Divergence", "Projection") if hasattr(pp.ad, name)}
@@ -91,9 +89,9 @@ class EquationSystem(pp.ad.EquationSystem):
         found: list[Any] = []
         for name in self._parse_equations(equations):
             found += self._recursive_discretization_search(self._equations[name], [])
-        for discretization, grids in uniquify_discretization_list(found).items():
+        for discretization, grids in AD_UTILS.uniquify_discretization_list(found).items():
             own = [g for g in grids if not self._discretize_together(self._client, discretization, g)]
-            discretize_from_list({discretization: own}, self.mdg)
+            AD_UTILS.discretize_from_list({discretization: own}, self.mdg)
 
     def _discretize_together(self, client: Client, discretization: Any, grid: Any) -> bool:
         """Discretise a grid on all ranks, if that can be and pays; whether it was."""

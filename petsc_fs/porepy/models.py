@@ -84,7 +84,8 @@ class NoFiles(pp.SolutionStrategy):
     def set_geometry(self) -> None:
         """Mesh with gmsh, whose files go to a temporary directory."""
         with tempfile.TemporaryDirectory() as directory:
-            self.params["meshing_kwargs"] = {"file_name": str(Path(directory) / "mesh")}
+            mesh = Path(directory) / "mesh"  # up to PorePy 1.11 a string
+            self.params["meshing_kwargs"] = {"file_name": mesh if hasattr(pp.ad, "ad_utils") else str(mesh)}
             super().set_geometry()
 
 

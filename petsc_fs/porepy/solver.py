@@ -227,7 +227,8 @@ class FieldSplitSolver:
             forcing = self._forcing_term(residual)
             solver = self._updated_solver(scene)
             first = scene.metadata.newton_index == 0 and forcing is None
-            result = solver.solve(forcing, error=UNNOTICED * self._increment_tolerance if first else math.inf)
+            error = UNNOTICED * self._increment_tolerance if first else math.inf
+            result = solver.solve(forcing, error=error, rounding=self._rounding())
             if not self.linear_solves:
                 self._refuse_unused()
         action, failure = self._judge(result, policy)
@@ -360,6 +361,12 @@ class FieldSplitSolver:
         else:
             self._solver.update(scene)
         return self._solver
+
+    def _rounding(self) -> dict[str, float]:
+        """Norm of each field that a change needs to be one of the state."""
+        state = self.equation_system.get_variable_values(iterate_index=0)
+        parts = self._prepare_adapter().from_porepy(state).items()
+        return {field: float(np.finfo(float).eps * np.linalg.norm(values)) for field, values in parts}
 
     def _judge(self, result: Result, policy: str) -> tuple[str, str]:
         """Action and failure of a record, see `LinearSolve`."""
