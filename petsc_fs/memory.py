@@ -47,7 +47,8 @@ def peak() -> int:
 
 
 def reset_peak() -> bool:
-    """Forget the peak so far; whether the system did. Local."""
+    """Give back what is freed, and forget the peak so far; whether the system did. Local."""
+    return_freed()
     try:
         CLEAR.write_text(RESET_PEAK, encoding="ascii")
     except OSError:
@@ -79,17 +80,16 @@ class Phases:
     """
 
     def __init__(self) -> None:
+        self.separate = reset_peak()
         self.start = held()
         self.peaks: dict[str, int] = {}
         self.helds: dict[str, int] = {}
-        self.separate = reset_peak()
 
     def end(self, phase: str) -> None:
         """The phase that began with the end of the last one is over; it may have several parts. Local."""
         self.peaks[phase] = max(peak(), self.peaks.get(phase, 0))
-        return_freed()
-        self.helds[phase] = held()
         self.separate = reset_peak() and self.separate
+        self.helds[phase] = held()
 
     def report(self, comm: MPI.Intracomm) -> dict[str, Any]:
         """All ranks' memory in bytes, as JSON can hold it.

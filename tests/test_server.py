@@ -115,7 +115,7 @@ def test_small_systems_are_solved_on_fewer_ranks(database):
     small = load("flow")  # of 1,248 unknowns
 
     def body(client):
-        for least, ranks in ((5000, 1), (1248, 1), (624, min(2, comm.size)), (1, comm.size)):
+        for least, ranks in ((3000, 1), (1248, 1), (624, min(2, comm.size)), (1, comm.size)):
             PETSc.Options().setValue("petsc_fs_least_rows", least)
             solver = ServedSolver(client, small)
             assert solver.layout.comm.size == ranks

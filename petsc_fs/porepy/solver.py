@@ -146,7 +146,7 @@ class FieldSplitSolver:
         -petsc_fs_keep_affine <true>: parts of equations that are affine in the unknowns are evaluated again only when
             what they are made of has changed; see `petsc_fs.porepy.equations`.
         -petsc_fs_share <true>: large grids are discretised by all ranks.
-        -petsc_fs_least_rows <5000>: unknowns that a rank should have; smaller systems are solved on fewer ranks.
+        -petsc_fs_least_rows <3000>: unknowns that a rank should have; smaller systems are solved on fewer ranks.
 
     Attributes:
         linear_solves: one record per solve, in the order of solving.

@@ -54,6 +54,7 @@ def main() -> int:
     comm = MPI.COMM_WORLD
     if job.memory_limit is not None:
         resource.setrlimit(resource.RLIMIT_AS, (job.memory_limit, job.memory_limit))
+    memory.return_freed()
     log = Log(Path(sys.argv[2]), comm)
     try:
         for scene in job.scenes:
@@ -155,7 +156,6 @@ class Probe:
             )
         self.is_sequence = bool(steps)
         self.steps, self.read_seconds = self._timed(lambda: self._read_steps(steps))
-        memory.return_freed()
         memory.reset_peak()
         self.base = self.comm.allgather(memory.held())
 
