@@ -204,7 +204,8 @@ class ServedSolver:
     Attributes:
         layout: distribution of the rows.
         rebuilds: how often the solver was made anew because the fields or grids had changed.
-        transfer_seconds: spent since the last update began on bringing the scene to the ranks and solutions back.
+        transfer_seconds: spent since the last update began on calling the ranks and bringing solutions back; what
+            brings the values of a scene to them is building.
     """
 
     def __init__(self, client: Client, scene: Scene, *, prefix: str = "") -> None:
@@ -236,7 +237,7 @@ class ServedSolver:
             self._sizes = dict(scene.sizes)
         else:
             self._client.call("update", self._handle, load=scene)
-        self.transfer_seconds = time.perf_counter() - started
+        self.transfer_seconds = time.perf_counter() - started - self._client.rank.built_seconds(self._handle)
 
     def solve(
         self, rtol: float | None = None, *, error: float = math.inf, rounding: Mapping[str, float] | None = None
@@ -319,6 +320,10 @@ class _Rank:
     def knows(self, handle: int) -> bool:
         """Whether a solver is there. Local, the same on all ranks."""
         return handle in self._kept
+
+    def built_seconds(self, handle: int) -> float:
+        """Of a solver that was just built or updated. On rank 0."""
+        return float(self._kept[handle].built_seconds)
 
     def set_options(self, options: Mapping[str, str | None]) -> None:
         """Take over rank 0's options database."""

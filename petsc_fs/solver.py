@@ -39,6 +39,7 @@ class Solver:
         -retry_*: what -petsc_fs_retry's file has, with this prefix.
 
     Attributes:
+        built_seconds: spent since the last solve on building PETSc's matrices and setting the preconditioner up.
         rtol: relative tolerance, -ksp_rtol.
         layout: distribution of the rows.
         system: the present system.
@@ -100,7 +101,7 @@ class Solver:
         self.rtol, self._atol = float(tolerances[0]), float(tolerances[1])
         self._finalizer = weakref.finalize(self, _dropped.__setitem__, number, _Parts(self))
         self._finalizer.atexit = False  # where nothing collective may depend on what is alive on a rank
-        self._built_seconds = time.perf_counter() - started
+        self.built_seconds = time.perf_counter() - started
 
     def __repr__(self) -> str:
         default = self._chosen.file.name if self._chosen.file else "the smallest solver"
@@ -176,7 +177,7 @@ class Solver:
             self.ksp.setOperators(self._matrix, self._matrix)
         self._drop_retry()
         PETSc.garbage_cleanup(self.layout.comm)
-        self._built_seconds = time.perf_counter() - started
+        self.built_seconds = time.perf_counter() - started
 
     def _forget_blocks(self) -> None:
         """Matrices are in PETSc now; of the scene only what explains and checks the solution is kept."""
@@ -201,7 +202,7 @@ class Solver:
                         f"{e}".replace(f"cell {number}", f"cell {self.layout.scene_cell(name, number)}", 1)
                     ) from None
                 raise
-        self._built_seconds += time.perf_counter() - started
+        self.built_seconds += time.perf_counter() - started
 
     def solve(
         self,
@@ -245,8 +246,8 @@ class Solver:
         else:
             with self._options():
                 result = self._solve_again(file, wanted, first)
-        result = replace(result, setup_seconds=self._built_seconds)
-        self._built_seconds = 0.0
+        result = replace(result, setup_seconds=self.built_seconds)
+        self.built_seconds = 0.0
         return result
 
     def _first(self, wanted: float, error: float, rounding: Mapping[str, float] | None) -> Result:
@@ -333,7 +334,7 @@ class Solver:
         if self._retry is None:
             self._retry = _Retry(self, name)
         _set_up(self._retry.ksp)
-        self._built_seconds += time.perf_counter() - started
+        self.built_seconds += time.perf_counter() - started
         second = self._run(self._retry.ksp, wanted)
         if not isinstance(first, Result):
             return replace(second, notes=(f"first solve: {first}; again by {name}", *second.notes))

@@ -86,9 +86,8 @@ class LinearSolve:
         rebuilds: how often, in this run so far, PETSc's objects were made anew because the sparsity had
             changed, or the grids.
         seconds: of the whole solve: the sum of the next three and a little.
-        transfer_seconds: of cutting PorePy's matrix into fields, sending values to the ranks and getting the
-            update back into PorePy's order.
-        setup_seconds: of building PETSc's matrices and setting the preconditioner up.
+        transfer_seconds: of cutting PorePy's matrix into fields and getting the update back into PorePy's order.
+        setup_seconds: of building PETSc's matrices, which brings values to the ranks, and setting the preconditioner up.
         solve_seconds: of the Krylov method.
     """
 
