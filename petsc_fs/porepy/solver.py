@@ -87,7 +87,7 @@ class LinearSolve:
             changed, or the grids.
         seconds: of the whole solve: the sum of the next three and a little.
         transfer_seconds: of cutting PorePy's matrix into fields and getting the update back into PorePy's order.
-        setup_seconds: of building PETSc's matrices, which brings values to the ranks, and setting the preconditioner up.
+        setup_seconds: of building PETSc's matrices, which brings values to ranks, and setting the preconditioner up.
         solve_seconds: of the Krylov method.
     """
 
