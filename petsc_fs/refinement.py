@@ -92,10 +92,8 @@ class Refinement:
         is_determined: whether the equations determine the solution to `DETERMINED`.
     """
 
-    def __init__(
-        self, system: System, ksp: PETSc.KSP, rtol: float, atol: float, rounding: Mapping[str, float] | None = None
-    ) -> None:
-        self.system, self.ksp, self.rtol, self._rounding = system, ksp, rtol, rounding or {}
+    def __init__(self, system: System, ksp: PETSc.KSP, rtol: float, atol: float, rounding: Mapping[str, float]) -> None:
+        self.system, self.ksp, self.rtol, self._rounding = system, ksp, rtol, rounding
         self.x, self.r, self.d = (system.b.duplicate() for _ in range(3))
         self.max_it = int(ksp.getTolerances()[3])
         self.passes: list[int] = []  # iterations of each

@@ -101,6 +101,7 @@ class Solver:
         self.rtol, self._atol = float(tolerances[0]), float(tolerances[1])
         self._finalizer = weakref.finalize(self, _dropped.__setitem__, number, _Parts(self))
         self._finalizer.atexit = False  # where nothing collective may depend on what is alive on a rank
+        self._rounding: dict[str, float] = {}
         self.built_seconds = time.perf_counter() - started
 
     def __repr__(self) -> str:
@@ -229,13 +230,13 @@ class Solver:
         Raises:
             SolveError: PETSc failed on the way, or the solution is not finite.
         """
-        wanted = max(self.rtol, rtol or 0.0)
+        wanted, self._rounding = max(self.rtol, rtol or 0.0), dict(rounding or {})
         if rhs is not None:
             self.system.set_rhs(rhs)
         file = PETSc.Options(self.prefix).getString("petsc_fs_retry", "none")
         first: Result | SolveError | SceneError
         try:
-            first = self._first(wanted, error, rounding)
+            first = self._first(wanted, error)
         except (SolveError, SceneError) as e:
             if file == "none":
                 raise
@@ -250,20 +251,18 @@ class Solver:
         self.built_seconds = 0.0
         return result
 
-    def _first(self, wanted: float, error: float, rounding: Mapping[str, float] | None) -> Result:
+    def _first(self, wanted: float, error: float) -> Result:
         """By the options of this solver. Collective."""
         self.set_up()
         with self._options():
-            result = self._run(self.ksp, wanted, error, rounding)
+            result = self._run(self.ksp, wanted, error)
             return result if result.converged else self._look_for_null_vectors(result, wanted)
 
-    def _run(
-        self, ksp: PETSc.KSP, wanted: float, error: float = math.inf, rounding: Mapping[str, float] | None = None
-    ) -> Result:
+    def _run(self, ksp: PETSc.KSP, wanted: float, error: float = math.inf) -> Result:
         """The Krylov method and its corrections, and what comes of them. Collective."""
         started = time.perf_counter()
         system = self.system
-        run = Refinement(system, ksp, wanted, self._atol if self._atol > PETSC_ATOL else 0.0, rounding)
+        run = Refinement(system, ksp, wanted, self._atol if self._atol > PETSC_ATOL else 0.0, self._rounding)
         try:
             run.first()
             run.correct()

@@ -104,6 +104,20 @@ def test_a_smaller_error_can_be_asked_for(clean, name):
     solver.destroy()
 
 
+def test_what_is_rounding_of_something_larger_is_no_error(clean):
+    """A field that is allowed an error has its estimate beside a thousand times that; others are as they were."""
+    scene = load("model2")
+    solver = Solver(scene)
+    plain = solver.solve(1e-6)
+    size = {f: float(np.linalg.norm(values)) for f, values in scene.reference.items()}
+    allowed = solver.solve(1e-6, rounding={"mass": 10.0 * size["mass"]})
+    for f, estimate in plain.estimated_error_by_field.items():
+        assert estimate > 0
+        assert allowed.estimated_error_by_field[f] == pytest.approx(estimate * (1e-4 if f == "mass" else 1), rel=0.01)
+    assert solver.solve(1e-6).estimated_error_by_field == pytest.approx(plain.estimated_error_by_field)
+    solver.destroy()
+
+
 def test_a_preconditioner_in_the_database_is_the_users(database):
     database(x_pc_type="jacobi", x_ksp_type="gmres", x_ksp_max_it="3")
     solver = Solver(load("biot"), prefix="x_")
