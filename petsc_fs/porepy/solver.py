@@ -196,10 +196,8 @@ class FieldSplitSolver:
         from petsc_fs.porepy.equations import EquationSystem
 
         if not hasattr(self, "equation_system"):
-            keep, share = (
-                PETSc.Options(self._options_prefix).getBool(f"petsc_fs_{what}", True)
-                for what in ("keep_affine", "share")
-            )
+            database = PETSc.Options(self._options_prefix)
+            keep, share = database.getBool("petsc_fs_keep_affine", True), database.getBool("petsc_fs_share", True)
             client = self._client if share else None
             self.equation_system = EquationSystem(self.mdg, keep=keep, client=client)  # type: ignore[attr-defined]
         super().set_equation_system_manager()  # type: ignore[misc]
