@@ -142,10 +142,10 @@ class FieldSplitSolver:
             makes use of it, but never further than to -ksp_rtol; see `petsc_fs.porepy.forcing.EisenstatWalker`.
             Residuals are measured as Newton does, by the model's `compute_residual_norm`. Its parameters are those of
             `petsc_fs.porepy.forcing.EisenstatWalkerParameters`.
-        -petsc_fs_keep_affine <true>: parts of equations that are affine in the unknowns are evaluated again only when
+        -petsc_fs_keep_affine <True>: parts of equations that are affine in the unknowns are evaluated again only when
             what they are made of has changed; see `petsc_fs.porepy.equations`. This and the next one are asked for
             before an options file is: they belong on the command line.
-        -petsc_fs_share <true>: large grids are discretised by all ranks.
+        -petsc_fs_share <True>: large grids are discretised by all ranks.
         -petsc_fs_least_rows <3000>: unknowns that a rank should have; smaller systems are solved on fewer ranks.
 
     Attributes:
