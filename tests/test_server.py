@@ -208,7 +208,7 @@ def test_stop_and_start_again():
 
 SERVED = """
 import sys, os, signal, time
-import petsc4py; petsc4py.init(["program"])
+import petsc4py; petsc4py.init(["program", "-petsc_fs_least_rows", "1"])
 from mpi4py import MPI
 from petsc_fs import options, server
 from petsc_fs.io import hdf5
