@@ -63,6 +63,17 @@ class Program:
             time.sleep(0.05)
         return text.splitlines()
 
+    def end_killed(self, rank: int) -> str:
+        """Standard output once the process of a rank was killed: all end soon, without a traceback."""
+        os.kill(rank, signal.SIGKILL)
+        started = time.monotonic()
+        code, out, err = self.end(60)
+        assert time.monotonic() - started < SECONDS_TO_END
+        assert code != 0
+        assert "Traceback" not in err
+        assert "PETSC ERROR" not in err
+        return out
+
     def ranks(self) -> list[int]:
         """Numbers of the processes that run the program."""
         found = []
