@@ -41,6 +41,8 @@ SHARED = {pp.Biot, pp.Mpsa, pp.Mpfa}
 """Discretisations that take `specified_nodes`."""
 SMALLEST_PART = 500
 """Cells that a rank should have to discretise for work to be shared out."""
+SPECIFIED = {"specified_cells", "specified_faces", "specified_nodes"}
+"""Parameters by which a discretisation is that of a part already."""
 
 
 class EquationSystem(pp.ad.EquationSystem):
@@ -104,17 +106,13 @@ class EquationSystem(pp.ad.EquationSystem):
         parameters = data[pp.PARAMETERS][keyword]
         owners = bisect(grid.cell_centers.T, np.ones(grid.num_cells), ranks)
         parts = [Part(type(discretization), keyword, grid, parameters, owners, r) for r in range(ranks)]
-        if hasattr(grid, "periodic_face_map") or SPECIFIED & parameters.keys() or len(parts[0].rows()) < 4:
+        rows = [part.rows() for part in parts]
+        if hasattr(grid, "periodic_face_map") or SPECIFIED & parameters.keys() or len(rows[0]) < 4:
             return False
         pieces = client.share(Part.discretize, parts)
-        rows = [part.rows() for part in parts]
         order = {size: np.argsort(np.concatenate([own[size] for own in rows])) for size in rows[0]}
         data[pp.DISCRETIZATION_MATRICES][keyword].update(_joined(pieces, order))
         return True
-
-
-SPECIFIED = {"specified_cells", "specified_faces", "specified_nodes"}
-"""Parameters by which a discretisation is that of a part already."""
 
 
 class Part(NamedTuple):
